@@ -8,6 +8,7 @@ when it comes back under another name.
 
 import glob
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -89,6 +90,8 @@ def udev_rule_path() -> Path:
 
 def _pids_with_lock(device: str) -> Iterator[int]:
     """Lines of /proc/locks: `1: FLOCK ADVISORY WRITE pid major:minor:inode start end`."""
+    if sys.platform != "linux":
+        return
     try:
         status = os.stat(device)
         lines = Path("/proc/locks").read_text().splitlines()

@@ -2,6 +2,7 @@
 
 import os
 import select
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,7 +11,12 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from emmc_rig.drivers.clock import Clock
-from emmc_rig.drivers.errors import PortGoneError, PortNotFoundError, TransportTimeoutError
+from emmc_rig.drivers.errors import (
+    PortError,
+    PortGoneError,
+    PortNotFoundError,
+    TransportTimeoutError,
+)
 from emmc_rig.drivers.transport import Transport
 
 READ_SIZE = 4096
@@ -120,6 +126,7 @@ class PtyServer:
         self.port = ""
         self._firmware, self._link = firmware, link
         self._wake_read, self._wake_write = os.pipe()
+        self._device = self._line = -1
         self.is_open = False
 
     def __enter__(self) -> Self:
@@ -176,7 +183,12 @@ class PtyServer:
             self.is_open = True
 
     def _open(self) -> None:
-        # Windows has no pseudo-terminals; the wire in memory must import there too.
+        if sys.platform == "win32":
+            raise PortError(
+                "by a pseudo-terminal",
+                "exists on Linux and macOS alone",
+                "simulate the device in a rig's file",
+            )
         import tty
 
         self._device, self._line = os.openpty()

@@ -11,15 +11,13 @@ A source is read again and again; a source that fails or is late does not delay 
 from __future__ import annotations
 
 import math
-import os
 import re
 import shlex
-import signal
-import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +27,7 @@ import serial
 from pydantic import Field, model_validator
 
 from emmc_rig.drivers.ports import find_port
+from emmc_rig.drivers.program import run_program
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.settings import Settings
 
@@ -133,7 +132,9 @@ def _asking(config: SourceConfig) -> Iterator[Callable[[], str]]:
     if config.file is not None:
         yield partial(_read_file, Path(config.file))
     elif config.command is not None:
-        yield partial(_run, shlex.split(config.command), config.limit_s)
+        # On Windows a program is started by a line, in which a backslash divides folders.
+        words = config.command if sys.platform == "win32" else shlex.split(config.command)
+        yield partial(run_program, words, config.limit_s)
     else:
         port = _Port(config)
         try:
@@ -145,27 +146,6 @@ def _asking(config: SourceConfig) -> Iterator[Callable[[], str]]:
 def _read_file(path: Path) -> str:
     with path.open(encoding="utf-8", errors="replace") as file:
         return file.read(MOST_BYTES)
-
-
-def _run(words: list[str], limit_s: float) -> str:
-    with subprocess.Popen(
-        words,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        start_new_session=True,  # Ctrl-C is the capture's; what it started ends with it
-    ) as process:
-        try:
-            text, _ = process.communicate(timeout=limit_s)
-        except subprocess.TimeoutExpired as fault:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            raise TimeoutError(f"gave no answer within {limit_s:g} s") from fault
-    if process.returncode:
-        raise ValueError(f"exit code {process.returncode}: {one_line(text) or 'no output'}")
-    return text
 
 
 class _Port:

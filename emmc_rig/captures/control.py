@@ -6,10 +6,8 @@ import os
 import select
 import signal
 import sys
-import termios
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -18,7 +16,7 @@ from typing import Any
 from emmc_rig.errors import StoppedError
 
 PAUSE_POLL_S = 0.05
-ENDING = ("SIGTERM", "SIGHUP")
+ENDING = ("SIGTERM", "SIGBREAK" if sys.platform == "win32" else "SIGHUP")
 """A request to end, and a terminal that closed."""
 
 
@@ -89,7 +87,7 @@ class Control:
 
 @contextmanager
 def interruptible(control: Control, say: Callable[[str], None]) -> Iterator[None]:
-    """Let Ctrl-C stop after the present frame, and the second one, SIGTERM or SIGHUP now.
+    """Let Ctrl-C stop after the present frame, and the second one, or `ENDING`, now.
 
     Within a hook the first one stops now too. "Now" raises `KeyboardInterrupt` in the main thread.
     Elsewhere than there nothing is changed.
@@ -144,6 +142,14 @@ def signals_interrupt() -> Iterator[None]:
 @contextmanager
 def pressed_keys() -> Iterator[Callable[[], str]]:
     """Yield a function that returns the key just pressed, "" for none, or where none can be."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        yield lambda: msvcrt.getwch() if sys.stdin.isatty() and msvcrt.kbhit() else ""
+        return
+    import termios
+    import tty
+
     before = None
     with suppress(termios.error, OSError, ValueError):  # where keys come from no terminal
         before = termios.tcgetattr(sys.stdin)

@@ -219,6 +219,14 @@ class Focusing(Settings):
     span_um: Positive = Field(default=400.0, description="to either side of where the axis stands")
 
 
+class Trigger(Settings):
+    """A pulse on a line of the camera, as of the stage or the lamp, begins every frame."""
+
+    source: str = Field(min_length=1, description="the camera's name of the line, as Line1")
+    edge: Literal["rising", "falling"] = "rising"
+    limit_s: Positive = Field(default=10.0, description="a pulse that comes later is lost")
+
+
 class Film(Settings):
     """A film of the scene: frame after frame, each at its time, by the plan's shots in turn.
 
@@ -251,6 +259,12 @@ class Plan(Settings):
         default=None,
         description="module:function, called before every frame and after the last, see "
         "`emmc_rig.captures.between`",
+    )
+    trigger: Trigger | None = Field(
+        default=None, description="a line of the camera begins every frame; default: the program"
+    )
+    exposure_output: str | None = Field(
+        default=None, min_length=1, description="line of the camera that is high while it exposes"
     )
     focus: Focusing | None = Field(
         default=None, description=f"`{BEFORE_SHOTS}`, or when: needs an axis named focus"
@@ -426,6 +440,8 @@ darks:
 order: least-travel         # or as-planned
 settle_s: 0                 # after a move, beyond the stage's own
 # between: lab:hook         # a function in lab.py, called before every frame (docs: Hooks)
+# trigger: {{source: Line1}}  # pulses on this line of the camera begin the frames; edge: falling
+# exposure_output: Line2    # this line of the camera is high while it exposes
 # focus: before-shots       # the axis `focus` goes to where the scene is sharpest
 
 retries:

@@ -23,7 +23,15 @@ from emmc_rig.commands.options import (
     RigSizeOption,
     out_option,
 )
-from emmc_rig.commands.output import emit, give_result, json_wanted, say, show_reason, tell
+from emmc_rig.commands.output import (
+    emit,
+    give_result,
+    json_wanted,
+    naming_stage,
+    say,
+    show_reason,
+    tell,
+)
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.progress import Event, Watcher
 from emmc_rig.store.folders import is_session
@@ -132,7 +140,8 @@ def capture(
     if not (page or steer):
         refuse(context, given_names(context) & {"host"}, "without --page or --steer")
     shown = None if not (page or steer) else "steers" if steer else "shows"
-    _run(plan, chosen, until_db, dry_run, out, shown, host, other_devices)
+    with naming_stage(rig or ""):
+        _run(plan, chosen, until_db, dry_run, out, shown, host, other_devices)
 
 
 def _write_plan(name: str, path: Path) -> None:

@@ -20,6 +20,7 @@ import hashlib
 import os
 import re
 import shutil
+import sys
 import tempfile
 import threading
 import time
@@ -123,7 +124,8 @@ class _Meter:
 
 
 _meter = _Meter()
-os.register_at_fork(after_in_child=_meter.__init__)  # the thread that compiled is not there
+if sys.platform != "win32":
+    os.register_at_fork(after_in_child=_meter.__init__)  # the thread that compiled is not there
 
 
 def compiling_s() -> float:

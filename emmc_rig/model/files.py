@@ -16,6 +16,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PART = ".part"
+PLAIN_FILE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+"""Flags of a file that is written: a link under its name leads the bytes elsewhere
+(POSIX), and the line ends of a file of text are changed (Windows)."""
 
 
 class Disk:
@@ -49,8 +52,14 @@ class Disk:
         path.mkdir(parents=True, exist_ok=True)
 
     def sync(self, path: Path) -> None:
-        """Return when the bytes of a file, or the names in a folder, are on the disk."""
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        """Return when the bytes of a file, or the names in a folder, are on the disk.
+
+        Windows syncs files alone, those opened for writing; its file systems keep a journal of
+        names.
+        """
+        if sys.platform == "win32" and path.is_dir():
+            return
+        descriptor = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
         try:
             _sync(descriptor)
         finally:
@@ -84,9 +93,7 @@ def _sync(descriptor: int) -> None:
 
 
 def _write(path: Path, data: bytes | memoryview, flags: int) -> None:
-    flags |= os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
-    # A link under the name would lead the bytes elsewhere.
-    descriptor = os.open(path, flags | os.O_NOFOLLOW, 0o666)
+    descriptor = os.open(path, flags | os.O_WRONLY | os.O_CREAT | PLAIN_FILE, 0o666)
     try:
         left = memoryview(data).cast("B")
         while left:
@@ -114,13 +121,9 @@ def is_abandoned(name: str) -> bool:
 
 def is_running(process: int) -> bool:
     """Return whether another process of that number runs."""
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return process != os.getpid()
+    import psutil  # `os.kill(process, 0)` would end the process on Windows
+
+    return 0 < process < 2**31 and process != os.getpid() and psutil.pid_exists(process)
 
 
 @contextmanager

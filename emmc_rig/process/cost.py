@@ -16,7 +16,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import re
-import resource
 import sys
 from pathlib import Path
 
@@ -126,12 +125,16 @@ def peak_memory_mib() -> float:
     On Linux from /proc: there getrusage starts a new program with the peak of the one that
     started it, and would count the parent's memory as the child's.
     """
-    try:
+    if sys.platform == "win32":
+        import psutil
+
+        return psutil.Process().memory_info().peak_wset / 2**20
+    if sys.platform == "linux":
         status = Path("/proc/self/status").read_text("ascii", errors="replace")
-    except OSError:
-        status = ""
-    if match := re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE):
-        return int(match[1]) / 1024
+        if match := re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE):
+            return int(match[1]) / 2**10
+    import resource
+
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
@@ -142,7 +145,9 @@ def forget_peak() -> bool:
     Linux resets it where 5 is written to /proc/self/clear_refs, see proc_pid_clear_refs(5).
     """
     gc.collect()
-    if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "malloc_trim"):
+    if sys.platform != "linux":
+        return False
+    if hasattr(library := ctypes.CDLL(None), "malloc_trim"):
         library.malloc_trim(0)
     try:
         Path("/proc/self/clear_refs").write_text("5", "ascii")

@@ -89,15 +89,22 @@ def _make(path: Path) -> bool:
 
 def _claim(path: Path, descriptor: int) -> None:
     """Write into the locked file who holds it; raises `TakenError` where the file is the lock."""
-    holder = _read(os.pread(descriptor, 4096, 0))
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    holder = _read(os.read(descriptor, 4096))
     if holder.get("by_file"):
         raise TakenError(path, holder, by_file=True)
     with suppress(OSError):  # on a full disk the lock holds without a name
         os.ftruncate(descriptor, 0)  # a killed program's name must not be read any more
-        os.pwrite(descriptor, _own_name(by_file=False), 0)
+        os.lseek(descriptor, 0, os.SEEK_SET)
+        os.write(descriptor, _own_name(by_file=False))
 
 
 def _release(path: Path, own: os.stat_result, unlock: Callable[[], None] = lambda: None) -> None:
+    if sys.platform == "win32":
+        unlock()  # an open file cannot be removed there
+        with suppress(OSError):  # the next program has it open: it removes the file
+            path.unlink()
+        return
     try:
         with suppress(FileNotFoundError):
             if os.path.samestat(own, os.lstat(path)):
@@ -122,9 +129,14 @@ def command_line() -> str:
 
 
 def _holder(path: Path) -> dict[str, Any]:
-    """Return who wrote a lock file; empty where it is not written yet, or gone."""
+    """Return who wrote a lock file; empty where it is not written yet, or gone.
+
+    The first byte, a brace, is not read: on Windows it is what the holder has locked.
+    """
     try:
-        return _read(path.read_bytes())
+        with open(path, "rb", buffering=0) as file:
+            file.seek(1)
+            return _read(b"{" + file.read(4096))
     except FileNotFoundError:
         return {}
 

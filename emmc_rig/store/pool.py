@@ -11,7 +11,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import platform
-import resource
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,10 +19,10 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.memory_limit import limit_memory
 from emmc_rig.model.reading import one_line
 from emmc_rig.version import __version__
 
@@ -119,19 +118,18 @@ class Pool:
         """Stop what is computed; later tasks are refused."""
 
 
-def _begin(program: Connection, most_bytes: int | None) -> None:
+def _begin(program: Any, most_bytes: int | None) -> None:
     """Prepare a process of the pool: it ends with the program, which alone hears Ctrl-C.
 
-    program: read until it is closed. most_bytes: of data the process may map, so that allocating
-    more raises MemoryError. What is mapped but never touched (220 MiB) outweighs the pages of
+    program: end of a pipe, read until it is closed. most_bytes: of data the process may map (on
+    Linux), see `limit_memory`. What is mapped but never touched (220 MiB) outweighs the pages of
     libraries (150 MiB) that do not count.
     """
     import cv2
 
     cv2.setNumThreads(1)
     if most_bytes is not None:
-        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, hard))
+        limit_memory(most_bytes, f"a worker needs more memory than {most_bytes / 2**20:.0f} MiB")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def follow() -> None:

@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,6 +44,27 @@ def test_a_task_needs_more_for_larger_blocks_halos_and_shots_and_never_less_than
     assert need(1, 300, 20) < need(1, 300, 40) < need(1, 384, 40) < need(3, 384, 40)
     assert need(1, 384, 40) > 1.4 * 2**30
     assert need(1, 64, 8) == need(1, 32, 8) < need(2, 32, 8)
+
+
+WITHOUT_A_LIMIT_OF_THE_SYSTEM = """
+import sys, time
+import numpy as np, psutil
+from emmc_rig.model.memory_limit import held_bytes, limit_memory
+sys.platform = "darwin"
+limit_memory(held_bytes() + 100 * 2**20, "too large")
+kept = [np.ones(5 * 2**20)]
+time.sleep(0.2)
+print("40 MiB are held", flush=True)
+kept.append(np.ones(20 * 2**20))
+time.sleep(60)
+"""
+
+
+def test_a_process_that_exceeds_its_limit_ends_where_the_system_has_none():
+    typed = [sys.executable, "-c", WITHOUT_A_LIMIT_OF_THE_SYSTEM]
+    ended = subprocess.run(typed, capture_output=True, text=True, timeout=50)
+    assert (ended.returncode, ended.stderr) == (1, "too large\n")
+    assert ended.stdout == "40 MiB are held\n"
 
 
 @pytest.mark.slow

@@ -107,6 +107,13 @@ def test_a_lock_of_version_0_4_holds(tmp_path):
     take_lock(tmp_path / "lock")()
 
 
+def test_the_holder_is_read_without_the_byte_that_windows_locks(tmp_path, holder):
+    content = (tmp_path / "lock").read_bytes()
+    (tmp_path / "lock").write_bytes(b"?" + content[1:])
+    with pytest.raises(TakenError, match=rf"process {holder.pid} on "):
+        take_lock(tmp_path / "lock")
+
+
 def test_a_lock_by_file_of_version_0_4_holds(tmp_path):
     name = {"command": "emmc-rig capture", "process": 7, "host": "bench", "by_file": True}
     (tmp_path / "lock").write_text(json.dumps(name))

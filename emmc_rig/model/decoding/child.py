@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import resource
 import subprocess
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -21,11 +20,13 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.decoding.regular import check_regular
 from emmc_rig.model.json_text import one_line, parse_json
+from emmc_rig.model.memory_limit import held_bytes, limit_memory
 from emmc_rig.model.reading import FREE_BYTES, MOST_COMPRESSED
 
 COPIES = 4
 """Of an array at once: as packed, as unpacked, as float32, as sent."""
 PATIENCE_S = 600
+TOO_LARGE = "it unpacks to more than a file of its size can hold"
 
 
 def read_in_child(
@@ -148,12 +149,6 @@ def _stacked(arrays: Sequence[NDArray], paths: Sequence[str]) -> NDArray:
     return np.stack(arrays) if len(arrays) > 1 else np.asarray(arrays[0])
 
 
-def _data_bytes() -> int:
-    """Return what the process holds of what RLIMIT_DATA counts."""
-    pages = int(Path("/proc/self/statm").read_text().split()[5])
-    return pages * resource.getpagesize()
-
-
 class _Pipe:
     """The output: NumPy would ask a file for its position, which a pipe has not."""
 
@@ -166,10 +161,9 @@ class _Pipe:
 def main() -> int:
     """Read what standard input asks for; return the exit code."""
     job = parse_json(sys.stdin.buffer.read(), "the job", ValueError)
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     try:
         read = READERS[job["kind"]](job["name"], job["apart"])
-        resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + job["most_bytes"], hard))
+        limit_memory(held_bytes() + job["most_bytes"], TOO_LARGE)
         found = [read(path) for path in job["paths"]]
         array = _stacked([array for array, _ in found], job["paths"])
         facts = [facts for _, facts in found]
@@ -179,7 +173,7 @@ def main() -> int:
         _Pipe.write(json.dumps({**facts[0], "opaque": opaque}).encode() + b"\n")
         np.lib.format.write_array(_Pipe(), array, allow_pickle=False)
     except MemoryError:
-        print("it unpacks to more than a file of its size can hold", file=sys.stderr)
+        print(TOO_LARGE, file=sys.stderr)
         return 1
     except Exception as fault:  # decoders raise whatever they run into
         print(one_line(fault) or type(fault).__name__, file=sys.stderr)

@@ -7,13 +7,13 @@ loads), the timed runs, the peak of memory; only then the light field is compare
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import psutil
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
@@ -170,7 +170,7 @@ def measured(point: Point, chart: ChartSettings) -> dict:
     settings, dictionary = point.configuration.settings, chart.dictionary
     trial.dictionary(method, dictionary)
     _window(trial).solved(method, settings, dictionary)
-    load = os.getloadavg()[0]
+    load = psutil.getloadavg()[0]
     forget_peak()
     held_mib = peak_memory_mib()
     wall, cpu, result = [], [], None
