@@ -622,6 +622,8 @@ class _Controller:
             _log.warning("alarm %d: %s", message.code, message.meaning)
             self._alarm = message
         elif isinstance(message, codec.Banner):
+            if message.version.startswith("0."):
+                raise FirmwareError(f"Grbl {message.version} answers", codec.NEWER_FIRMWARE)
             self._restarted = True
             self._on_lost("the controller restarted")
         elif isinstance(message, codec.Setting):

@@ -34,6 +34,8 @@ from emmc_rig.drivers.stage import Direction, StageSettings
 from emmc_rig.drivers.transport import SerialTransport
 from emmc_rig.session.journal import FrameEntry, of_kind
 from emmc_rig.session.session import Session
+from emmc_rig.simulators.clock import ManualClock
+from emmc_rig.simulators.grbl import GrblController
 
 pytestmark = [pytest.mark.peers, pytest.mark.slow, pytest.mark.timing]
 
@@ -99,15 +101,17 @@ class Controller:
     def say(self, *lines):
         """Send lines as another program would; each must be accepted."""
         with closing(opened(self.port)) as port:
-            identify(port)
 
-            def accepted():
+            def answered(begins, again=b""):
                 with suppress(TransportTimeoutError):
-                    return port.read_until(b"\n") == b"ok\r\n"
+                    return port.read_until(b"\n").startswith(begins)
+                port.write(again)
+                return False
 
+            wait_until(lambda: answered(b"<", again=codec.STATUS_QUERY))
             for line in lines:
                 port.write(line.encode() + b"\n")
-                wait_until(accepted)
+                wait_until(lambda: answered(b"ok"))
 
 
 def opened(port):
@@ -181,6 +185,34 @@ def test_the_firmware_as_it_is_shipped_homes_moves_and_is_homed_anew_by_each_con
     with closing(opened(controller.port)) as port:
         # Idle also follows `$X`, so this state is no proof of homing.
         assert not GrblStage(port, AXES, SYSTEM_CLOCK, CARE).is_homed("x")
+
+
+ASKED = (
+    "$J=G91X1F100", "G0X1", "$130=0x", "$999=1", "$C1", "$X", "$J=G91X1", "$J=X5F100",
+    "$J=G53X-90F100", "$J=M3X1F100", "G1X-1", "$HX",
+)  # fmt: skip
+"""Lines to a controller that was not homed; after the last, Grbl's state is that of homing."""
+
+
+def test_the_simulated_firmware_refuses_what_the_original_does(controller):
+    """Homing of one axis above all, which a kinder simulator would allow."""
+    controller.start()
+    with closing(opened(controller.port)) as port:
+        identify(port)
+        original = [answer_of(port, line) for line in ASKED]
+    clock = ManualClock()
+    settings = SETTINGS | {first + n: of for first, of in OF_AXES.items() for n in range(3)}
+    simulated = GrblController(clock, settings=settings).transport()
+    identify(simulated, clock)
+    assert [answer_of(simulated, line) for line in ASKED] == original
+
+
+def answer_of(port, line):
+    """Return a line and the error or ok by which it is answered."""
+    port.write(line.encode() + b"\n")
+    while not (answer := port.read_until(b"\n").strip()).startswith((b"ok", b"error")):
+        pass
+    return line, answer.decode()
 
 
 def test_a_soft_limit_alarm_keeps_the_position_and_a_reset_loses_it(controller):
