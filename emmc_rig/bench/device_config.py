@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import Field, TypeAdapter, ValidationError, create_model
@@ -275,7 +275,8 @@ def parse_camera(spec: str) -> CameraChoice:
     The file holds `driver` (in earlier versions `kind`), `address` and what that driver takes.
     Raises AppError with one line.
     """
-    if not spec.endswith((".yaml", ".yml")) or ":" in spec:
+    is_path = ":" not in spec or PureWindowsPath(spec).drive
+    if not (spec.endswith((".yaml", ".yml")) and is_path):
         driver, _, address = spec.partition(":")
         return CameraChoice(driver, address, source=f"camera {shown_path(spec)}")
     read = read_yaml(Path(spec), AppError)

@@ -11,6 +11,8 @@ import scipy.io
 import yaml
 from programs import PROGRAM
 
+from emmc_rig.bench.device_config import parse_camera
+from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import shipped_camera_files
 from emmc_rig.process.reconstructing import open_frames
 from emmc_rig.session.board_sets import decoded
@@ -82,6 +84,11 @@ def test_a_bench_is_captured_imported_and_reconstructed(tmp_path, run):
         )  # fmt: skip
     metrics = json.loads((tmp_path / "result/metrics.json").read_text("utf-8"))
     assert metrics["workers"] == 2, metrics
+
+
+def test_a_path_that_begins_with_a_drive_names_no_driver():
+    with pytest.raises(AppError, match="no such file"):
+        parse_camera(r"C:\bench\camera.yaml")
 
 
 def test_what_needs_a_pseudo_terminal_is_refused_in_a_line(run):
