@@ -36,7 +36,8 @@ class Camera(Protocol):
 
     Requested and actual setting differ where the camera has steps: `exposure_s` and `gain` are the
     actual settings, read back from the camera. Optional members: `stream` of `StreamingCamera`;
-    `stream_at`, `rate_limits_hz` and `stop_exposure` as in `drivers.u3v.U3vCamera`.
+    `stream_at`, `rate_limits_hz`, `stop_exposure`, `set_trigger` and `set_exposure_output` as in
+    `drivers.u3v.U3vCamera`.
     """
 
     @property

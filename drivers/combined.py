@@ -2,9 +2,10 @@
 
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
+from typing import Any
 
 from emmc_rig.drivers.errors import UnknownAxisError
-from emmc_rig.drivers.stage import Stage, StageIdentity, check_within_limits
+from emmc_rig.drivers.stage import Direction, Stage, StageIdentity, check_within_limits
 
 
 class CombinedStage(Stage):
@@ -44,6 +45,22 @@ class CombinedStage(Stage):
             for number, stage in enumerate(self._stages, 1)
             for name, celsius in getattr(stage, "temperatures_c", dict)().items()
         }
+
+    def pressed_switches(self) -> dict[str, Direction | None]:
+        """Return the axes on a limit switch, of the stages that report it; see `GrblStage`."""
+        return {
+            axis: away
+            for stage in self._stages
+            for axis, away in getattr(stage, "pressed_switches", dict)().items()
+        }
+
+    def move_off_switch(self, axis: str, away: Direction, step_um: float) -> bool:
+        """As `GrblStage.move_off_switch`, of the stage that reports the switch as pressed."""
+        for stage in self._stages:
+            if axis in getattr(stage, "pressed_switches", dict)():
+                reporting: Any = stage
+                return reporting.move_off_switch(axis, away, step_um)
+        return True
 
     def is_homed(self, axis: str) -> bool:
         """Return whether the axis knows where it is."""

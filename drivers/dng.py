@@ -22,6 +22,7 @@ from emmc_rig.drivers.raw import (
     BLACK_ROWS_TAG,
     BLACK_TAG,
     CFA_TILE_PREFIX,
+    EXIF_TIME,
     RawFrame,
     hashed,
 )
@@ -148,6 +149,8 @@ def _file_tags(
             (305, ASCII, 0, facts.software, True),
             (50735, ASCII, 0, identity.serial, True),
         ]
+        if facts.captured is not None:
+            tags.append((306, ASCII, 0, facts.captured.strftime(EXIF_TIME), True))
         tags = [tag for tag in tags if tag[3] != ""]
         tags.append((STAND_IN_TAG, LONG, 1, 0, True))
     if private is not None:
@@ -216,10 +219,10 @@ def _exif(facts: Facts, serial: str, exposure_s: float | None) -> dict[int, tupl
     if facts.iso is not None:
         found[34855] = SHORT, struct.pack("<H", min(facts.iso, LARGEST_ISO))
     if (at := facts.captured) is not None:
-        found[36867] = text(at.strftime("%Y:%m:%d %H:%M:%S"))
-        found[37521] = text(f"{at.microsecond // 1000:03d}")
+        found[36867] = text(at.strftime(EXIF_TIME))
+        found[37520] = found[37521] = text(f"{at.microsecond // 1000:03d}")
         if at.tzinfo is not None:
-            found[36881] = text(at.isoformat()[-6:])
+            found[36880] = found[36881] = text(at.isoformat()[-6:])
     if facts.unique_id:
         found[42016] = text(facts.unique_id)
     if serial:
@@ -269,9 +272,17 @@ def frame_of_array(
     identity: CameraIdentity,
     host_time_s: float,
     metadata: Mapping[str, str],
+    captured: datetime | None = None,
+    camera_time_s: float | None = None,
 ) -> RawFrame:
-    """Return the frame of a camera that gives arrays, kept as the DNG that it decodes from."""
-    original = encode_dng(mosaic, cfa, black_level_dn, white_level_dn, exposure_s, identity)
+    """Return the frame of a camera that gives arrays, kept as the DNG that it decodes from.
+
+    captured: time of day, with a time zone; None: now. camera_time_s: see `RawFrame`.
+    """
+    facts = Facts(captured=captured or datetime.now().astimezone())
+    original = encode_dng(
+        mosaic, cfa, black_level_dn, white_level_dn, exposure_s, identity, facts=facts
+    )
     own, black = mosaic.copy(), np.full((2, 2), float(black_level_dn))
     own.flags.writeable = black.flags.writeable = False
     with hashed(original) as digest:
@@ -284,6 +295,7 @@ def frame_of_array(
         exposure_s,
         original,
         digest.hexdigest(),
+        camera_time_s=camera_time_s,
         host_time_s=host_time_s,
         metadata={**described, **metadata},
     )

@@ -3,6 +3,8 @@
 from typing import Self
 
 SHOWN_BYTES = 48
+ALL_AXES = "every axis"
+"""The `axis` of an error of a controller as a whole."""
 
 
 def _shown(raw: bytes) -> str:
@@ -15,7 +17,8 @@ def _shown(raw: bytes) -> str:
 class DriverError(Exception):
     """Root of the drivers' errors; shown to the user as one line.
 
-    `axis`, `command` and `reply` are what the error is about, "" where unknown.
+    `axis`, `command` and `reply` are what the error is about, `stage` how the stage was named when
+    it was opened; "" where unknown.
     `loses_position`: the axis no longer knows where it is.
     """
 
@@ -30,9 +33,11 @@ class DriverError(Exception):
         self.axis = axis
         self.command = command
         self.reply = reply
+        self.stage = ""
 
-    def about(self, *, axis: str = "", command: str = "", reply: str = "") -> Self:
+    def about(self, *, axis: str = "", command: str = "", reply: str = "", stage: str = "") -> Self:
         """Fill in what was unknown where the error arose; returns the same error."""
+        self.stage = self.stage or stage
         self.axis = self.axis or axis
         self.command = self.command or command
         self.reply = self.reply or reply
@@ -237,6 +242,23 @@ class LimitSwitchError(AxisFaultError):
     usual_advice = "check the limits and what is in the way, then home the axis"
 
 
+class PressedSwitchError(LimitSwitchError):
+    """The axis stands on a limit switch: homing could drive it deeper, and was not begun.
+
+    away: "up" or "down", the direction that leads off the switch; "" where it is unknown.
+    """
+
+    def __init__(self, axis: str, away: str = "", reply: str = "") -> None:
+        way = f"{away}wards" if away else "away from the end of the travel at which it stands"
+        super().__init__(
+            axis,
+            "it stands on its limit switch",
+            f"move it off the switch, {way}, before it is homed",
+        )
+        self.away = away
+        self.reply = reply
+
+
 class LostPositionError(AxisFaultError):
     """The axis no longer knows where it is."""
 
@@ -323,6 +345,10 @@ class CardFullError(
 
 class CaptureError(_WordedError, says="no frame, {}", advice="capture it again"):
     """The camera was released but gave no usable frame; the next may be taken."""
+
+
+class NoFrameError(CaptureError, advice="check the trigger and the cable"):
+    """No frame began within its time."""
 
 
 class ExposureStoppedError(
@@ -452,6 +478,10 @@ class FolderCameraError(DriverError):
     def __init__(self, folder: str, reason: str) -> None:
         super().__init__(f"no frame from {folder}, {reason}: name a folder of RAW files")
         self.reason = reason
+
+
+class LightError(DriverError):
+    """The lights did not confirm the colour that was sent to them."""
 
 
 class MicroManagerError(DriverError):

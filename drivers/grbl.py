@@ -2,29 +2,36 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 
 from emmc_rig.drivers import grbl_codec as codec
 from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
 from emmc_rig.drivers.errors import (
+    ALL_AXES,
     AxisFaultError,
     CommandRefusedError,
+    DriverError,
     FirmwareError,
     GarbledReplyError,
     LimitSwitchError,
     LostPositionError,
+    PositionMismatchError,
+    PressedSwitchError,
     ScaleError,
     StalledError,
     TransportTimeoutError,
 )
 from emmc_rig.drivers.stage import (
     DEFAULT_SETTINGS,
+    Direction,
     HostStage,
     Reading,
     StageIdentity,
     StageSettings,
     check_tolerance,
+    move_time_limit_s,
 )
 from emmc_rig.drivers.transport import Transport, repeated, turns
 
@@ -37,14 +44,17 @@ BOOT_S = 4.0
 REPORTS_UNTIL_OFFSET = 40
 """Grbl reports the work offset in every 30th report at the latest ("Interface", WCO)."""
 POLL_S = 0.05
-AXIS_LETTERS = "XYZABC"
+OFF_SWITCH_SPEED_UM_S = 1000.0
+"""Of a step off a limit switch: half a millimetre takes half a second, in which a hand is at the
+power switch."""
+SWITCH_CHANGES = 4
+"""Alarms in one step off a switch: of its release, and of a contact that bounces."""
 REPORT_STEP_UM = 1.0
 """Reports have three decimals of a millimetre."""
 FACTORY_STEPS_PER_MM = 250.0
 """What `$100` to `$105` hold before anybody has set them (Grbl's defaults.h, generic)."""
 SCALES_AGREE = 1e-3
 """Relative; Grbl shows three decimals of steps per millimetre."""
-ALL_AXES = "every axis"
 SINGLE_AXIS_HOMING = "H"
 """Among the options of `$I`; a compile-time option, off by default (Grbl's config.h)."""
 REFUSAL_ADVICE = {
@@ -72,6 +82,8 @@ class GrblStage(HostStage):
     The travel lies below zero, as Grbl has it, and ends short of the homing switches. Grbl does
     not report whether it was homed, and is idle as well after `$X`, so every axis must be homed
     after connecting. Firmware without option H in `$I`, as it is shipped, homes all axes together.
+    From a pressed limit switch no homing is begun: Grbl takes every pressed switch for the home
+    switch, and from the far end of the travel its pull-off leads deeper (limits.c, limits_go_home).
     The scale is the controller's `$100` and following; `steps_per_mm`, by name of an axis, states
     the expected scale, without which the firmware's default counts as never set. Construction
     waits up to BOOT_S for the controller to start; it moves nothing. Raises `ScaleError`, or
@@ -89,10 +101,15 @@ class GrblStage(HostStage):
     ) -> None:
         super().__init__(axes, (transport,), clock, settings)
         for letter in axes.values():
-            if letter not in AXIS_LETTERS:
-                raise ValueError(f"axis letter {letter!r}: use one of {', '.join(AXIS_LETTERS)}")
+            if letter not in codec.AXIS_LETTERS:
+                known = ", ".join(codec.AXIS_LETTERS)
+                raise ValueError(f"axis letter {letter!r}: use one of {known}")
         self._transport = transport
         self._letters = dict(axes)
+        self._headings: dict[str, Direction] = {}
+        """Where the axes were sent by the motion under way, by letter."""
+        self._away: dict[str, Direction] = {}
+        """By letter of an axis that ran into a limit switch: the direction that it came from."""
         self._stated_steps_per_mm = dict(steps_per_mm or {})
         for axis in self._stated_steps_per_mm:
             self._require_axis(axis)
@@ -107,6 +124,95 @@ class GrblStage(HostStage):
         """Return the identity, with the text that a user wrote by `$I=` as the serial number."""
         firmware, _, written = self._build.get("VER", "").partition(":")
         return StageIdentity("", "Grbl", written, firmware)
+
+    def home(self, axes: Iterable[str] | None = None) -> None:
+        """As `HostStage.home`; raises `PressedSwitchError` before an axis on a switch moves."""
+        with self._naming_switches():
+            super().home(axes)
+        self._away.clear()
+
+    def move_to_um(self, targets_um: Mapping[str, float]) -> dict[str, float]:
+        """As `HostStage.move_to_um`; raises `PressedSwitchError` where a move ends on a switch."""
+        with self._naming_switches():
+            return super().move_to_um(targets_um)
+
+    def pressed_switches(self) -> dict[str, Direction | None]:
+        """Return the axes on a limit switch, each with the direction that leads off it.
+
+        None where the direction is unknown: Grbl does not report at which end an axis stands, so
+        that only a move of this object which ended on the switch shows it. A letter of
+        the controller without a name on this stage stands for itself. A controller in alarm, which
+        may report nothing, is reset; it stands.
+        """
+        self._controller.leave_alarm()
+        pressed = self._controller.status().pressed
+        return {self._name(letter): self._away.get(letter) for letter in pressed}
+
+    def move_off_switch(self, axis: str, away: Direction, step_um: float) -> bool:
+        """Move an axis off its limit switch by one slow step; return whether it is released.
+
+        axis: as `pressed_switches` names it. The axis must be homed before its next move. A switch
+        that is released raises the alarm of a hard limit too (limits.c); the step then goes on.
+        Raises `PressedSwitchError` when the switch of another axis is pressed on the way,
+        `PositionMismatchError` when the step falls short, and what a move raises.
+        """
+        letter = self._letters.get(axis, axis)
+        before = self.pressed_switches()
+        self._mark_unknown(self._axes, "it was moved off a limit switch")
+        index = codec.AXIS_LETTERS.index(letter)
+        target_mm = self._controller.machine_position_mm()[1][index] + away.sign * step_um / 1e3
+        top_um_s = self._controller.setting(codec.MAX_RATE + index) / 60 * 1e3
+        speed_um_s = min(OFF_SWITCH_SPEED_UM_S, top_um_s)
+        line = codec.jog({letter: target_mm}, speed_um_s * 60 / 1e3)
+        limits_s = {axis: move_time_limit_s(step_um, speed_um_s)}
+        with self._soft_limits_off(), self._stopped_on_error((axis,)):
+            for _ in range(SWITCH_CHANGES):
+                self._controller.unlock()
+                try:
+                    self._controller.command(line, axis)
+                    self._wait_until_idle(limits_s, self._clock.now_s(), self._is_moving)
+                except LimitSwitchError as release:
+                    _log.debug("on the way off the switch: %s", release)
+                pressed = self.pressed_switches()
+                if newly := sorted(pressed.keys() - before.keys()):
+                    raise PressedSwitchError(newly[0])
+                at_um = self._controller.machine_position_mm()[1][index] * 1e3
+                if abs(at_um - target_mm * 1e3) <= self._settings.tolerance_um:
+                    return axis not in pressed
+        raise PositionMismatchError(axis, target_mm * 1e3, at_um, self._settings.tolerance_um)
+
+    @contextmanager
+    def _soft_limits_off(self) -> Iterator[None]:
+        """Switch off `$20`, by which Grbl refuses jogs outside the travel, also back into it."""
+        stated = self._controller.settings[codec.SOFT_LIMITS].text
+        if not self._controller.setting(codec.SOFT_LIMITS):
+            yield
+            return
+        self._controller.command(f"${codec.SOFT_LIMITS}=0")
+        try:
+            yield
+        finally:
+            self._controller.leave_alarm()
+            self._controller.command(f"${codec.SOFT_LIMITS}={stated}")
+
+    @contextmanager
+    def _naming_switches(self) -> Iterator[None]:
+        """Raise `PressedSwitchError` for a `LimitSwitchError` after which a switch is pressed."""
+        self._headings = {}
+        try:
+            yield
+        except PressedSwitchError:
+            raise
+        except LimitSwitchError as fault:
+            self._away = {letter: way.opposite for letter, way in self._headings.items()}
+            try:
+                pressed = self.pressed_switches()
+            except DriverError as silent:
+                _log.warning("the switches cannot be read: %s", silent)
+                raise fault from None
+            for axis, away in pressed.items():
+                raise PressedSwitchError(axis, away or "", fault.reply) from None
+            raise
 
     def stop(self, axes: Iterable[str] | None = None) -> None:
         """As `HostStage.stop`; all axes stop together, and a program that runs is held."""
@@ -124,6 +230,7 @@ class GrblStage(HostStage):
         self._options = self._build.get("OPT", "").split(",")[0]
         self._controller.command("$$")
         mark_all_unknown("no homing since the connection was opened")
+        self._away.clear()
         self._move_speeds_um_s = {axis: self._top_speed_um_s(axis) for axis in self._axes}
         for axis in self._axes:
             self._check_scale(axis)
@@ -147,7 +254,13 @@ class GrblStage(HostStage):
     def _start_home(self, axes: tuple[str, ...]) -> None:
         some = set(axes) != set(self._axes)
         lines = [f"$H{self._letters[axis]}" for axis in axes] if some else ["$H"]
-        self._controller.leave_alarm()
+        pressed = self.pressed_switches()
+        moved = set(axes) if some else pressed.keys()
+        for axis in sorted(moved & pressed.keys()):
+            raise PressedSwitchError(axis, pressed[axis] or "")
+        for axis in axes:
+            way = Direction.DOWN if self._homes_downwards(axis) else Direction.UP
+            self._headings[self._letters[axis]] = way
         self._controller.start_homing(lines)
 
     def _is_homing(self, axis: str) -> bool:
@@ -160,6 +273,11 @@ class GrblStage(HostStage):
         length_um = math.hypot(*distances_um.values())
         speed_um_s = length_um / slowest_s if slowest_s else self.speed_um_s(next(iter(targets_um)))
         targets_mm = {self._letters[axis]: um / 1e3 for axis, um in targets_um.items()}
+        self._headings = {
+            self._letters[axis]: Direction.UP if um > start_um[axis] else Direction.DOWN
+            for axis, um in targets_um.items()
+            if um != start_um[axis]
+        }
         line = codec.jog(targets_mm, speed_um_s * 60 / 1e3)
         self._controller.command(line, ", ".join(targets_um))
 
@@ -183,13 +301,15 @@ class GrblStage(HostStage):
         """Return the travel, short of the switch by as much as homing pulled off."""
         travel_um = self._positive(codec.TRAVEL, axis) * 1e3
         pull_off_um = self._controller.setting(codec.HOMING_PULL_OFF) * 1e3
-        directions = int(self._controller.setting(codec.HOMING_DIRECTIONS))
-        homes_downwards = directions >> self._index(axis) & 1
-        if not homes_downwards:
+        if not self._homes_downwards(axis):
             return -travel_um, -pull_off_um
         if "Z" in self._options:
             return pull_off_um, travel_um
         return -travel_um + pull_off_um, 0.0
+
+    def _homes_downwards(self, axis: str) -> bool:
+        directions = int(self._controller.setting(codec.HOMING_DIRECTIONS))
+        return bool(directions >> self._index(axis) & 1)
 
     def _apply_speed(self, axis: str, speed_um_s: float) -> None:
         self._move_speeds_um_s[axis] = speed_um_s
@@ -221,7 +341,12 @@ class GrblStage(HostStage):
             )
 
     def _index(self, axis: str) -> int:
-        return AXIS_LETTERS.index(self._letters[axis])
+        return codec.AXIS_LETTERS.index(self._letters[axis])
+
+    def _name(self, letter: str) -> str:
+        """Return the axis of a letter, or the letter where no axis of this stage has it."""
+        names = {letter: axis for axis, letter in self._letters.items()}
+        return names.get(letter, letter)
 
     def _positive(self, first: int, axis: str) -> float:
         number = first + self._index(axis)
@@ -385,6 +510,11 @@ class _Controller:
         if waits or state not in ("Idle", "Alarm"):
             self._reset()
         self._alarm, self._restarted = None, False
+
+    def unlock(self) -> None:
+        """Let a controller in alarm move again, not homed."""
+        if self.status().state == "Alarm":
+            self.command("$X")
 
     def wait_for_boot(self) -> None:
         """Return when the controller answers; one that stays silent is reset once."""

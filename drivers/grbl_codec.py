@@ -20,6 +20,7 @@ SOFT_RESET = b"\x18"
 JOG_CANCEL = b"\x85"
 
 STATES = ("Idle", "Run", "Hold", "Jog", "Alarm", "Door", "Check", "Home", "Sleep")
+AXIS_LETTERS = "XYZABC"
 MM_PER_INCH = 25.4
 
 SOFT_LIMITS, HARD_LIMITS, HOMING, HOMING_DIRECTIONS = 20, 21, 22, 23
@@ -126,13 +127,18 @@ class Feedback:
 
 @dataclass(frozen=True)
 class Status:
-    """A status report; positions in the unit that `$13` says, None where the report has none."""
+    """A status report; positions in the unit that `$13` says, None where the report has none.
+
+    pressed: letters of the axes whose limit switch is pressed. Grbl has one input for both ends of
+    an axis: the letter does not say which end.
+    """
 
     state: str
     substate: int | None
     machine: tuple[float, ...] | None
     work: tuple[float, ...] | None
     offset: tuple[float, ...] | None
+    pressed: tuple[str, ...] = ()
 
 
 Message = Ok | Refusal | Alarm | Banner | Setting | Feedback | Status
@@ -213,7 +219,7 @@ def _decode_status(line: bytes, text: str) -> Status:
     )
     if machine is None and work is None:
         raise GarbledReplyError(line, "neither MPos nor WPos")
-    if offset is not None and len(offset) != len(machine or work or ()):
+    if machine is None and offset is not None and len(offset) != len(work or ()):
         raise GarbledReplyError(line, "offset and position of different length")
     return Status(
         state=match[1],
@@ -221,6 +227,7 @@ def _decode_status(line: bytes, text: str) -> Status:
         machine=machine,
         work=work,
         offset=offset,
+        pressed=tuple(letter for letter in values.get("Pn", "") if letter in AXIS_LETTERS),
     )
 
 

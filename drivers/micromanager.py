@@ -37,6 +37,7 @@ from emmc_rig.drivers.stage import (
     StageIdentity,
     StageSettings,
 )
+from emmc_rig.drivers.trigger import begin_by_line, show_exposure
 
 if TYPE_CHECKING:
     from pymmcore_plus import CMMCorePlus
@@ -202,6 +203,9 @@ class MicroManagerCamera:
         self._clock = clock
         self._setup = setup = setup or CameraSetup()
         self._exposure_s: float | None = None
+        # Properties of trigger and exposure output, in order, to set again after a reload.
+        self._lines: list[tuple[str, str]] = []
+        self._trigger_limit_s = 0.0
         self._closed = False
         try:
             self.label = setup.label or loaded.core.getCameraDevice()
@@ -280,6 +284,28 @@ class MicroManagerCamera:
         """Accept a gain of 1; raises as `set_exposure_s`."""
         check_setting("gain", gain, self.gain_limits)
 
+    def set_trigger(self, source: str, edge: str, limit_s: float) -> None:
+        """As `drivers.u3v.U3vCamera.set_trigger`, where the adapter has GenICam's properties."""
+        begin_by_line(self, source, edge)
+        self._trigger_limit_s = limit_s
+
+    def set_exposure_output(self, line: str) -> None:
+        """As `drivers.u3v.U3vCamera.set_exposure_output`, where the adapter has the properties."""
+        show_exposure(self, line)
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """As `drivers.trigger.Choices`."""
+        core = self._loaded.core
+        with calling(f"list the choices of {name}"):
+            has = core.hasProperty(self.label, name)
+            return tuple(core.getAllowedPropertyValues(self.label, name)) if has else ()
+
+    def choose(self, name: str, value: str) -> None:
+        """As `drivers.trigger.Choices`."""
+        with calling(f"set {name}"):
+            self._set_property(name, value)
+        self._lines.append((name, value))
+
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises `MicroManagerError` or `CameraClosedError`."""
         with self._alone() as core, calling("take a frame"):
@@ -317,6 +343,8 @@ class MicroManagerCamera:
             wanted["Binning"] = setup.binning
         with calling("set the camera"):
             for name, value in wanted.items():
+                self._set_property(name, value)
+            for name, value in self._lines:
                 self._set_property(name, value)
             core.setCameraDevice(self.label)
             core.clearROI()
@@ -369,7 +397,8 @@ class MicroManagerCamera:
             yield core
 
     def _next(self, core: CMMCorePlus) -> RawFrame:
-        deadline_s = self._clock.now_s() + self.exposure_s + FRAME_GRACE_S
+        wait_s = self.exposure_s + FRAME_GRACE_S + self._trigger_limit_s
+        deadline_s = self._clock.now_s() + wait_s
         while not core.getRemainingImageCount():
             if core.isBufferOverflowed():
                 raise CaptureError("the core's buffer ran over", "take frames more slowly")

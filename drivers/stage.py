@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import partial
 from itertools import chain
 from typing import NamedTuple, Protocol, Self, TypeVar
@@ -147,6 +148,23 @@ class StageSettings:
 
 
 DEFAULT_SETTINGS = StageSettings()
+
+
+class Direction(StrEnum):
+    """A direction along an axis: up leads to larger positions."""
+
+    UP = "up"
+    DOWN = "down"
+
+    @property
+    def sign(self) -> int:
+        """1 up, -1 down."""
+        return 1 if self is Direction.UP else -1
+
+    @property
+    def opposite(self) -> "Direction":
+        """The other direction."""
+        return Direction.DOWN if self is Direction.UP else Direction.UP
 
 
 class Reading(NamedTuple):

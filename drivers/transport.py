@@ -45,7 +45,7 @@ QUIET_LIMIT = 20
 """Reads of `discard_until_quiet` before a device counts as one that never falls silent."""
 RTS_PAUSE_S = 0.05
 BAUD = 115200
-"""Of every controller with a driver here."""
+"""Of every stage controller with a driver here."""
 QUERY_ATTEMPTS = 3
 FOREIGN_MESSAGES_TOLERATED = 64
 EXCHANGE_LIMIT_S = 2.0
@@ -166,6 +166,7 @@ class SerialTransport(Transport):
 
     `port` is named as `drivers.ports` says. `timeout_s` bounds a read, `write_timeout_s` a write
     (pyserial waits for ever by default). `flow_control` is RTS/CTS, which APT controllers want.
+    `baud`: bits per second.
     The port is opened for this process alone. Raises `PortNotFoundError`, `PortBusyError` or
     `PortPermissionError`.
     """
@@ -176,10 +177,11 @@ class SerialTransport(Transport):
         timeout_s: float = 0.5,
         write_timeout_s: float = 1.0,
         flow_control: bool = False,
+        baud: int = BAUD,
     ) -> None:
         super().__init__(port, timeout_s)
         self.write_timeout_s = write_timeout_s
-        self._flow_control = flow_control
+        self._flow_control, self._baud = flow_control, baud
         self._heard = False
         device = find_port(port)
         self._serial = self._open(device)
@@ -243,7 +245,7 @@ class SerialTransport(Transport):
         try:
             opened = serial.serial_for_url(
                 device,
-                baudrate=BAUD,
+                baudrate=self._baud,
                 timeout=self.timeout_s,
                 write_timeout=self.write_timeout_s,
                 rtscts=self._flow_control,

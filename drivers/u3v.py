@@ -32,6 +32,7 @@ from emmc_rig.drivers.errors import (
     CameraSettingError,
     CaptureError,
     DriverError,
+    NoFrameError,
     RawFrameError,
 )
 from emmc_rig.drivers.genapi import Features
@@ -45,6 +46,7 @@ from emmc_rig.drivers.pixel_formats import (
 )
 from emmc_rig.drivers.raw import RawFrame, hashed
 from emmc_rig.drivers.transport import repeated
+from emmc_rig.drivers.trigger import begin_by_line, show_exposure
 from emmc_rig.drivers.u3v_control import U3vControl
 from emmc_rig.drivers.u3v_stream import U3vStream
 from emmc_rig.drivers.usb import BULK, UsbDevice, open_device
@@ -109,6 +111,8 @@ class U3vCamera:
         self._clock = clock
         self._acquiring = False
         self._in_flight = 0
+        # The line that begins frames, and how long its pulse is waited for.
+        self._trigger, self._trigger_limit_s = "", 0.0
         try:
             self._open()
         except BaseException:
@@ -166,6 +170,28 @@ class U3vCamera:
             shown = 20 * math.log10(gain) if self._gain_in_decibels() else gain
             self.features.set_nearest(self._gain_name, shown)
         self._read_settings()
+
+    def set_trigger(self, source: str, edge: str, limit_s: float) -> None:
+        """Let a line begin every frame from now on, within limit_s; edge: rising or falling.
+
+        `NoFrameError` is raised for a frame without a pulse. Raises `CameraSettingError` for what
+        the camera lacks.
+        """
+        begin_by_line(self, source, edge)
+        self._trigger, self._trigger_limit_s = source, limit_s
+
+    def set_exposure_output(self, line: str) -> None:
+        """Let a line be high during exposures; raises as `set_trigger`."""
+        show_exposure(self, line)
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """As `drivers.trigger.Choices`."""
+        return self.features.choices(name) if self.features.has(name) else ()
+
+    def choose(self, name: str, value: str) -> None:
+        """As `drivers.trigger.Choices`; a feature that has the value already may be fixed."""
+        if self.features.is_writable(name) or self.features.value(name) != value:
+            self.features.set(name, value)
 
     def snap(self) -> RawFrame:
         """Expose and return one frame; raises a `DriverError`.
@@ -282,7 +308,16 @@ class U3vCamera:
         self._set_if_possible("TLParamsLocked", 0)
 
     def _receive(self) -> bytes:
-        return self._stream.receive(max(self.exposure_s, self._period_s) + FRAME_GRACE_S)
+        wait_s = max(self.exposure_s, self._period_s) + FRAME_GRACE_S + self._trigger_limit_s
+        try:
+            return self._stream.receive(wait_s)
+        except NoFrameError as fault:
+            if not self._trigger:
+                raise
+            raise NoFrameError(
+                f"no pulse came on {self._trigger} within {self._trigger_limit_s:g} s",
+                "check what gives the pulses, its cable, and trigger: in the plan",
+            ) from fault
 
     def _decode(self, original: bytes) -> RawFrame:
         host_time_s = self._clock.now_s()

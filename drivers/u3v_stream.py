@@ -18,6 +18,7 @@ from emmc_rig.drivers.errors import (
     CameraFormatError,
     CaptureError,
     ExposureStoppedError,
+    NoFrameError,
     UsbStalledError,
     UsbTimeoutError,
 )
@@ -164,7 +165,7 @@ class U3vStream:
         passed = 0
         room = self._sizes.leader
         while passed <= 2 * self._sizes.payload + self._sizes.transfer:
-            raw = self._transfer(room, deadline_s, "no frame came")
+            raw = self._transfer(room, deadline_s, "no frame came", NoFrameError)
             leader = _leader_at_end(raw)
             if leader is not None:
                 return leader
@@ -220,8 +221,17 @@ class U3vStream:
         if trailer.lines is not None and trailer.lines < leader.height:
             raise CaptureError(f"it has {trailer.lines} of {leader.height} lines", LOST_DATA_ADVICE)
 
-    def _transfer(self, size: int, deadline_s: float, complaint: str) -> memoryview:
-        """Return what one transfer of at most `size` bytes, rounded up, brings."""
+    def _transfer(
+        self,
+        size: int,
+        deadline_s: float,
+        complaint: str,
+        late: type[CaptureError] = CaptureError,
+    ) -> memoryview:
+        """Return what one transfer of at most `size` bytes, rounded up, brings.
+
+        late: raised after the deadline, with the complaint.
+        """
         room = self._pipe.whole_packets(size)
         if room not in self._buffers:
             self._buffers[room] = array.array("B", bytes(room))
@@ -229,7 +239,7 @@ class U3vStream:
         while True:
             left_s = deadline_s - self._clock.now_s()
             if left_s <= 0:
-                raise CaptureError(f"{complaint} in time", "check the trigger and the cable")
+                raise late(f"{complaint} in time", "check the trigger and the cable")
             try:
                 count = self._pipe.read_into(buffer, min(left_s, SLICE_S))
             except UsbTimeoutError:

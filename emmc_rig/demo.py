@@ -115,7 +115,7 @@ def place_rig(rig: Rig, frame: PlannedFrame) -> None:
     bench = frame.bench
     rig.attendant.place(bench.target, bench.board_turn_deg)
     rig.attendant.fit_masks(bench.fitting, bench.masks_in)
-    rig.attendant.set_lamp(bench.lamp)
+    rig.set_lamp(bench.lamp)
     rig.stage.move_to_um({axis: rig.zero_um[axis] + um for axis, um in bench.offsets_um.items()})
 
 

@@ -83,8 +83,8 @@ how many dB the square of the deviation was scaled from what held-out readings s
 
 
 PLACE_PX = 24
-"""Side of the square whose accuracy is stated apart: at one shot and two of 14 scenes, half of them
-with a mirror in it, its stated PSNR is that by the truth to within 4 dB in nine of ten."""
+"""Side of the square whose accuracy is stated apart, right to 6 dB in nine of ten trusted captures
+of group B (`benchmarks/stated.py`)."""
 
 
 class WorstPlace(NamedTuple):

@@ -430,6 +430,10 @@ class Bench:
         self._light = pixel_light(camera, size)
         self._seen: dict[tuple, Array] = {}
 
+    def set_lamp(self, colour: str) -> None:
+        """Switch the lamp to a colour of LAMPS."""
+        self.lamp = colour
+
     def readings(self) -> Array:
         """Return the noise-free readings (pixel_y, pixel_x) of the bench as it now stands."""
         levels = np.array(LAMPS[self.lamp]) * self._lamp.levels(self._seconds())

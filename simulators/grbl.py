@@ -2,8 +2,10 @@
 
 Simplified: every move of the queue starts and ends at rest; homing takes all its axes to their
 switches together, pulls off, touches the switch again slowly and pulls off; the receive buffer is
-never full. What is not modelled (arcs, probing, work offsets, spindle, check mode, ...) is refused
-as an unsupported command, and logged. The axes have no encoders: a stall loses steps unnoticed.
+never full. Both ends of an axis's travel have a switch, on one input, and stop the axis: homing
+from the switch at the far end fails, and drives no deeper. What is not modelled (arcs, probing,
+work offsets, spindle, check mode, ...) is refused as an unsupported command, and logged. The axes
+have no encoders: a stall loses steps unnoticed.
 Source of the messages: Grbl v1.1 documentation, "Interface", "Commands", "Jogging", "Realtime
 commands"; the order of a report's fields and its counters from report.c.
 """
@@ -21,7 +23,7 @@ from emmc_rig.drivers.clock import Clock
 from emmc_rig.simulators.firmware import SimulatedController, earliest_s
 from emmc_rig.simulators.motion import AxisSpec, End, Motor
 
-LETTERS = "XYZABC"
+LETTERS = codec.AXIS_LETTERS
 SMALL_AXIS = AxisSpec(microstep_um=0.3125, max_speed_um_s=8_000.0, backlash_um=3.0)
 BENCH_AXES = {"X": SMALL_AXIS, "Y": SMALL_AXIS, "Z": SMALL_AXIS}
 AS_SHIPPED, WITH_SINGLE_AXIS_HOMING = "V", "VH"
@@ -120,6 +122,8 @@ class GrblController(SimulatedController):
         self._ends: dict[str, End] = {}
         self._homing: deque[dict[str, tuple[float, float]]] = deque()
         self._homing_letters: tuple[str, ...] = ()
+        self._releasing: set[str] = set()
+        """Axes that a move takes off their limit switch; its change is an alarm, as a press is."""
         self._held = False
         self._modes = _Modes()
         self._reports_to_offset = 0
@@ -168,6 +172,7 @@ class GrblController(SimulatedController):
             if self._block is None and not self._homing_letters:
                 break
             hit = End.AT_END_OF_TRAVEL in self._ends.values()
+            hit |= not self._releasing.isdisjoint(self._ends)
             if hit and self.settings[codec.HARD_LIMITS] and not self._homing_letters:
                 self._alarm(1)
                 break
@@ -225,10 +230,15 @@ class GrblController(SimulatedController):
                 acceleration_mm_s2 = min(acceleration_mm_s2, most_mm_s2 / part)
         stalls = self.faults.strikes("stall", self._command)
         forever = self.faults.strikes("busy_forever", self._command)
+        self._releasing = {letter for letter in self._pressed() if parts.get(letter)}
         for letter, part in parts.items():
             if part:
+                target_mm = block.targets_mm[letter]
+                if letter in self._releasing and self.settings[codec.HARD_LIMITS]:
+                    step_mm = self.axes[letter].microstep_um / 1e3
+                    target_mm = start_mm[letter] + math.copysign(step_mm, steps_mm[letter])
                 self._motors[letter].go(
-                    block.targets_mm[letter] * 1e3,
+                    target_mm * 1e3,
                     speed_mm_min * part / 60 * 1e3,
                     acceleration_mm_s2 * part * 1e3,
                     stalls,
@@ -274,6 +284,7 @@ class GrblController(SimulatedController):
         self._blocks.clear()
         self._lines.clear()
         self._block = None
+        self._releasing = set()
         self._state = "Alarm"
         self._waits_for_reset = True
         self._say(f"ALARM:{code}")
@@ -387,8 +398,14 @@ class GrblController(SimulatedController):
         )
         self._homing_letters = letters
         self._state = "Home"
+        far_ends_um = {
+            axis: 0.0 if at_um else self.axes[axis].travel_um
+            for axis, (at_um, _) in at_and_off_um.items()
+        }
         if self.faults.strikes("stall", self._command):
             self._fail_homing(9)
+        elif any(self._motors[axis].true_um == um for axis, um in far_ends_um.items()):
+            self._fail_homing(8)
         else:
             self._next_homing_step(None)
 
@@ -518,6 +535,14 @@ class GrblController(SimulatedController):
             position_mm[letter] = steps * self.axes[letter].microstep_um / 1e3
         return position_mm
 
+    def _pressed(self) -> list[str]:
+        """Return the letters of the axes that stand at an end of their travel."""
+        return [
+            letter
+            for letter, motor in self._motors.items()
+            if not 0 < motor.true_um < self.axes[letter].travel_um
+        ]
+
     def _setting(self, first: int, letter: str) -> float:
         return self.settings[first + LETTERS.index(letter)]
 
@@ -545,6 +570,8 @@ class GrblController(SimulatedController):
         velocities = [motor.velocity_um_s() for motor in self._motors.values()]
         decimals = 0 if unit == 1 else 1
         fields.append(f"FS:{math.hypot(*velocities) * 60 / 1e3 / unit:.{decimals}f},0")
+        if pressed := self._pressed():
+            fields.append(f"Pn:{''.join(pressed)}")
         moving = self._state not in ("Idle", "Alarm")
         if self._reports_to_offset:
             self._reports_to_offset -= 1

@@ -17,8 +17,9 @@ from datetime import UTC, datetime, timedelta
 import cv2
 import numpy as np
 
+from emmc_rig.drivers.camera import CameraIdentity
 from emmc_rig.drivers.clock import Clock
-from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.dng import Facts, encode_dng
 from emmc_rig.drivers.errors import CameraFormatError
 from emmc_rig.drivers.ptp_codec import (
     EVERYTHING,
@@ -377,7 +378,15 @@ class PtpCameraSimulator:
         if self.quality != "raw":
             handles.append(self._store(f"{name}.JPG", Format.JPEG, _jpeg(mosaic)))
         if self.quality != "jpeg":
-            data = encode_dng(mosaic, self._cfa, self._black_dn, self._white_dn, exposure_s)
+            data = encode_dng(
+                mosaic,
+                self._cfa,
+                self._black_dn,
+                self._white_dn,
+                exposure_s,
+                CameraIdentity(self.maker, self.model, self.serial),
+                facts=Facts(self._values[Property.EXPOSURE_INDEX], self._moment()),
+            )
             if self.faults.strikes("torn_raw"):
                 data = data[: -len(data) // 4]
             handles.append(self._store(f"{name}.DNG", Format.DNG, data))
@@ -399,14 +408,17 @@ class PtpCameraSimulator:
         amplified = np.rint(black + gain * (mosaic.astype(np.float64) - black))
         return np.clip(amplified, 0, self._white_dn).astype(np.uint16)
 
+    def _moment(self) -> datetime:
+        """Return the time of day on the camera's own clock."""
+        return EPOCH + timedelta(seconds=self._clock.now_s())
+
     def _store(
         self, name: str, kind: int, data: bytes, parent: int = FOLDER, handle: int = 0
     ) -> int:
         if not handle:
             self._last_handle += 1
             handle = self._last_handle
-        moment = EPOCH + timedelta(seconds=self._clock.now_s())
-        stamp = moment.strftime("%Y%m%dT%H%M%S")
+        stamp = self._moment().strftime("%Y%m%dT%H%M%S")
         info = ObjectInfo(
             storage=STORAGE,
             format=kind,

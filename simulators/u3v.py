@@ -107,7 +107,8 @@ class U3vCameraSimulator(UsbFunction):
     have `shape`, the sensor's. `depths` names the formats offered, as in
     `drivers.pixel_formats.CODES`. `alignment_bits`: transfers are multiples of 2 to its power.
     Faults, armed with `faults.inject`, strike commands, frames or the middle of a payload, as their
-    names say; `when` is given a command's address, or a frame's number.
+    names say; `when` is given a command's address, or a frame's number. A line of `lines` can
+    begin frames: a function that returns when, at or after a time, it next rises (or falls).
     """
 
     def __init__(
@@ -129,6 +130,7 @@ class U3vCameraSimulator(UsbFunction):
         self._render = render
         self._clock = clock
         self.exposed_from_s = 0.0
+        self.lines: dict[str, Callable[[float, bool], float]] = {}
         self._shape = shape
         self._bits = bits
         self._black_level_dn = black_level_dn
@@ -365,10 +367,18 @@ class U3vCameraSimulator(UsbFunction):
     def _start(self) -> int:
         if not self._read_u32(SIRM, 0x04) & 1:
             return DISCARDED
-        triggered = self._read_u32(xml.BASE, xml.TRIGGER) & 1
-        start_s = float("inf") if triggered else self._clock.now_s()
+        start_s = self._trigger_s(self._clock.now_s())
         self._acquisition = _Acquisition(bool(self._read_u32(xml.BASE, xml.MODE)), start_s)
         return OK
+
+    def _trigger_s(self, after_s: float) -> float:
+        """Return when the next frame may begin: at once, or with the next edge of a line."""
+        trigger = self._read_u32(xml.BASE, xml.TRIGGER)
+        if not trigger & 1:
+            return after_s
+        line = self.lines.get(xml.LINES.get(trigger >> xml.SOURCE_SHIFT & 0xF, ""))
+        rising = not trigger >> xml.FALLING_BIT & 1
+        return float("inf") if line is None else line(after_s, rising)
 
     def _next_frame(self, timeout_s: float) -> bool:
         """Put the next frame on its way, waiting for it; return whether it came in time."""
@@ -394,10 +404,11 @@ class U3vCameraSimulator(UsbFunction):
             acquisition.next_start_s += missed * period_s
         if self.faults.strikes("dropped_frame", acquisition.block):
             acquisition.block += 1
-            acquisition.next_start_s += period_s
+            acquisition.next_start_s = self._trigger_s(acquisition.next_start_s + period_s)
         self._send(exposure_s, acquisition.block, acquisition.next_start_s)
         acquisition.block += 1
-        acquisition.next_start_s += float("inf") if triggered else period_s
+        after_s = exposure_s if triggered else period_s
+        acquisition.next_start_s = self._trigger_s(acquisition.next_start_s + after_s)
         if acquisition.single:
             self._acquisition = None
         return True

@@ -16,12 +16,15 @@ WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = 0x00, 0x04, 0x08, 0x0C
 WIDTH_MAX, HEIGHT_MAX, PIXEL_FORMAT, PAYLOAD = 0x10, 0x14, 0x18, 0x1C
 MODE, START, STOP, TRIGGER = 0x20, 0x24, 0x28, 0x2C
 EXPOSURE, GAIN, BLACK_LEVEL, LOCKED, FRAME_RATE, AUTO = 0x34, 0x38, 0x3C, 0x40, 0x44, 0x48
-SENSOR = 0x50
+LINE, SENSOR = 0x30, 0x50
 SIZE = 0x70
 
 EXPOSURE_TICK_US = 0.5
 GAIN_STEP_DB = 0.1
 TEMPERATURE_C = 38.5
+SOURCE_SHIFT, FALLING_BIT = 4, 8
+"""Bits in the register of the trigger: where its source begins (see LINES), and the edge's."""
+LINES = {1: "Line0", 2: "Line1"}
 AUTO_EXPOSURE_BIT, AUTO_GAIN_BIT = 0, 1
 
 Limits = tuple[int, int]
@@ -59,8 +62,15 @@ def describe(
         _choice("TriggerSelector", {"FrameStart": 0}, None),
         _choice("TriggerMode", {"Off": 0, "On": 1}, "TriggerModeReg"),
         _masked("TriggerModeReg", TRIGGER, 0, 0),
-        _choice("TriggerSource", {"Software": 0, "Line0": 1}, "TriggerSourceReg"),
+        _choice("TriggerSource", {"Software": 0, "Line0": 1, "Line1": 2}, "TriggerSourceReg"),
         _masked("TriggerSourceReg", TRIGGER, 4, 7),
+        _choice("TriggerActivation", {"RisingEdge": 0, "FallingEdge": 1}, "TriggerActivationReg"),
+        _masked("TriggerActivationReg", TRIGGER, FALLING_BIT, FALLING_BIT),
+        _choice("LineSelector", {"Line2": 0}, None),
+        _choice("LineMode", {"Input": 0, "Output": 1}, "LineModeReg"),
+        _masked("LineModeReg", LINE, 0, 0),
+        _choice("LineSource", {"Off": 0, "ExposureActive": 1}, "LineSourceReg"),
+        _masked("LineSourceReg", LINE, 4, 7),
         _choice("ExposureAuto", {"Off": 0, "Continuous": 1}, "ExposureAutoReg"),
         _masked("ExposureAutoReg", AUTO, AUTO_EXPOSURE_BIT, AUTO_EXPOSURE_BIT),
         _choice("GainAuto", {"Off": 0, "Continuous": 1}, "GainAutoReg"),
@@ -102,6 +112,7 @@ def describe(
         "Width Height OffsetX OffsetY WidthMax HeightMax SensorWidth SensorHeight PixelFormat "
         "PayloadSize AcquisitionMode "
         "AcquisitionStart AcquisitionStop TriggerSelector TriggerMode TriggerSource "
+        "TriggerActivation LineSelector LineMode LineSource "
         "ExposureAuto ExposureTime GainAuto Gain BlackLevel "
         "AcquisitionFrameRate TLParamsLocked SensorName DeviceVendorName DeviceModelName "
         "DeviceSerialNumber DeviceTemperature"

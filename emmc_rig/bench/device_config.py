@@ -1,14 +1,16 @@
-"""Configuration of stage and camera: a short `NAME:ADDRESS`, or a YAML file with more settings.
+"""Configuration of stage, camera and lights: `NAME:ADDRESS`, or a YAML file with more settings.
 
 A stage is `PROTOCOL:PORT`; single settings may follow,
 `zaber:/dev/ttyUSB0,microstep_um=0.49609375`; its file wires names to axes. A camera is
 `DRIVER:ADDRESS`.
 
-Another package brings stages and cameras by entry point, see `docs/plugins.md`: it names a factory
-in the group `emmc_rig.stages` or `emmc_rig.cameras`, whose name then goes wherever ours do.
+Another package brings stages, cameras and lights by entry point, see `docs/plugins.md`: it names a
+factory in the group `emmc_rig.stages`, `emmc_rig.cameras` or `emmc_rig.lights`, whose name then
+goes wherever ours do.
 
     stage factory(address, settings: StageSettings, clock: Clock, **options) -> drivers.stage.Stage
     camera factory(address, clock: Clock, **options) -> drivers.camera.Camera
+    lights factory(address, clock: Clock, **options) -> drivers.lights.Lights
 """
 
 from __future__ import annotations
@@ -17,19 +19,28 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path, PureWindowsPath
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, Self, get_type_hints
 
-from pydantic import Field, TypeAdapter, ValidationError, create_model
+from pydantic import (
+    Field,
+    TypeAdapter,
+    ValidationError,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
 from emmc_rig.drivers.apt import ACTUATORS
 from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.lights import COLOURS
 from emmc_rig.drivers.stage import StageSettings
 from emmc_rig.errors import AppError
 from emmc_rig.model.json_text import shown_path
 from emmc_rig.model.reading import one_line, parse_yaml, read_yaml
-from emmc_rig.model.settings import Settings, explain
+from emmc_rig.model.settings import Settings, explain, validated
 
 STAGE_PLUG_INS, CAMERA_PLUG_INS = "emmc_rig.stages", "emmc_rig.cameras"
+LIGHT_PLUG_INS = "emmc_rig.lights"
 
 
 def plug_ins(group: str) -> set[str]:
@@ -199,6 +210,17 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
     return stage_of(data | dict(overrides or {}), shown)
 
 
+def stages_of_rig(spec: str) -> list[Any] | None:
+    """Return the stages that a rig's YAML file names; None where `spec` is no such file."""
+    if not spec.endswith((".yaml", ".yml")):
+        return None
+    read = read_yaml(Path(spec), AppError)
+    if not isinstance(read, dict) or "protocol" in read or "stage" not in read:
+        return None
+    named = read["stage"]
+    return named if isinstance(named, list) else [named]
+
+
 def _require_actuators(axes: Any, source: str) -> None:
     """Raise AppError for an axis without an actuator: no controller reports what is plugged in."""
     known = ", ".join(ACTUATORS)
@@ -240,6 +262,104 @@ def stage_of(data: dict[str, Any], source: str) -> StageConfig:
     return config
 
 
+class _ColouredLights(Settings):
+    """Settings by colour, `off` among them."""
+
+    @field_validator("colours", mode="before", check_fields=False)
+    @classmethod
+    def _named(cls, colours: object) -> object:
+        if not isinstance(colours, dict):
+            return colours
+        # YAML reads a bare off as false, and on as true.
+        words = {"False": "off", "True": "on"}
+        named = {words.get(str(key), str(key)): value for key, value in colours.items()}
+        for colour in named:
+            if colour not in COLOURS:
+                raise ValueError(f"{colour} is no colour of lights: use {', '.join(COLOURS)}")
+        if named and "off" not in named:
+            raise ValueError("say how the lights are switched off, under off:")
+        return named
+
+
+class ExchangeConfig(Settings):
+    """What is sent to set a colour, line end included, and the line that confirms it."""
+
+    send: str = Field(min_length=1)
+    expect: str = Field(min_length=1)
+
+
+class TextLightsConfig(_ColouredLights):
+    """Lights on a serial line or TCP; see `drivers.lights.TextLights`.
+
+    ready: the line that the controller sends once it has started. limit_s: on each answer.
+    """
+
+    protocol: Literal["text"] = "text"
+    port: str
+    colours: dict[str, ExchangeConfig] = Field(min_length=1)
+    baud: Annotated[int, Field(gt=0)] = 9600
+    ready: str = ""
+    end: Annotated[str, Field(min_length=1, max_length=1)] = "\n"
+    limit_s: Positive = 3.0
+
+
+class CommandLightsConfig(_ColouredLights):
+    """A program for each colour, as a list of words; see `drivers.lights.CommandLights`."""
+
+    protocol: Literal["command"] = "command"
+    colours: dict[str, Annotated[tuple[str, ...], Field(min_length=1)]] = Field(min_length=1)
+    limit_s: Positive = 10.0
+
+
+class MicroManagerLightsConfig(_ColouredLights):
+    """A shutter, a state device or both; see `drivers.lights.MicroManagerLights`.
+
+    port: the configuration file. colours: positions of the device, or their names; a shutter alone
+    has off and white.
+    """
+
+    protocol: Literal["mm"] = "mm"
+    port: str
+    shutter: str = ""
+    device: str = ""
+    colours: dict[str, int | str] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _some_device(self) -> Self:
+        if not (self.shutter or self.device):
+            raise ValueError("name the label of a shutter: or of a state device:")
+        if bool(self.device) != bool(self.colours):
+            raise ValueError("device: and colours:, its position for each colour, go together")
+        return self
+
+
+class PluginLightsConfig(Settings):
+    """Lights of a plug-in; its factory gets `options` unchanged."""
+
+    protocol: str
+    port: str = ""
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+LightsConfig = (
+    TextLightsConfig | CommandLightsConfig | MicroManagerLightsConfig | PluginLightsConfig
+)
+
+
+def lights_of(data: Mapping[str, Any], source: str) -> LightsConfig:
+    """Return the lights that settings describe; raises AppError that begins with `source`."""
+    known: dict[str, type[LightsConfig]] = {
+        "text": TextLightsConfig,
+        "command": CommandLightsConfig,
+        "mm": MicroManagerLightsConfig,
+    }
+    known |= dict.fromkeys(sorted(plug_ins(LIGHT_PLUG_INS) - known.keys()), PluginLightsConfig)
+    protocol = str(data.get("protocol", ""))
+    if protocol not in known:
+        raise AppError(f"{source}: protocol must be one of {', '.join(known)}")
+    return validated(known[protocol], dict(data), source, AppError)
+
+
 DRIVER_KEYS = ("driver", "kind")
 """Of a camera's YAML file: the name of its driver, now and in earlier versions."""
 
@@ -269,20 +389,27 @@ def settings_of(kind: type[Any]) -> type[Settings]:
     return create_model(kind.__name__, __base__=Settings, **found)
 
 
-def parse_camera(spec: str) -> CameraChoice:
-    """Return the camera that `DRIVER:ADDRESS` or the name of a YAML file describes.
+def _names_yaml(spec: str) -> bool:
+    """Return whether a device is given by a YAML file; a drive's colon follows no driver's name."""
+    return spec.endswith((".yaml", ".yml")) and (
+        ":" not in spec or PureWindowsPath(spec).drive > ""
+    )
+
+
+def parse_camera(spec: str | Mapping[str, Any]) -> CameraChoice:
+    """Return the camera that `DRIVER:ADDRESS`, a YAML file's name, or its content describes.
 
     The file holds `driver` (in earlier versions `kind`), `address` and what that driver takes.
     Raises AppError with one line.
     """
-    is_path = ":" not in spec or PureWindowsPath(spec).drive
-    if not (spec.endswith((".yaml", ".yml")) and is_path):
+    if isinstance(spec, str) and not _names_yaml(spec):
         driver, _, address = spec.partition(":")
         return CameraChoice(driver, address, source=f"camera {shown_path(spec)}")
-    read = read_yaml(Path(spec), AppError)
+    source = shown_path(spec) if isinstance(spec, str) else "the rig's camera"
+    read = read_yaml(Path(spec), AppError) if isinstance(spec, str) else dict(spec)
     options = {str(key): value for key, value in read.items()} if isinstance(read, dict) else {}
     named = next((key for key in DRIVER_KEYS if isinstance(options.get(key), str)), None)
     if named is None:
-        raise AppError(f"{shown_path(spec)}: name the camera's driver, such as driver: mm")
+        raise AppError(f"{source}: name the camera's driver, such as driver: mm")
     driver, address = options.pop(named), str(options.pop("address", ""))
-    return CameraChoice(driver, address, options, shown_path(spec))
+    return CameraChoice(driver, address, options, source)

@@ -13,12 +13,11 @@ from __future__ import annotations
 import math
 import re
 import shlex
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,6 +27,7 @@ import serial
 from pydantic import Field, model_validator
 
 from emmc_rig.drivers.ports import find_port
+from emmc_rig.drivers.program import run_program
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.settings import Settings
 
@@ -134,7 +134,7 @@ def _asking(config: SourceConfig) -> Iterator[Callable[[], str]]:
     elif config.command is not None:
         # On Windows a program is started by a line, in which a backslash divides folders.
         words = config.command if sys.platform == "win32" else shlex.split(config.command)
-        yield partial(_run, words, config.limit_s)
+        yield partial(run_program, words, config.limit_s)
     else:
         port = _Port(config)
         try:
@@ -146,33 +146,6 @@ def _asking(config: SourceConfig) -> Iterator[Callable[[], str]]:
 def _read_file(path: Path) -> str:
     with path.open(encoding="utf-8", errors="replace") as file:
         return file.read(MOST_BYTES)
-
-
-def _run(words: str | list[str], limit_s: float) -> str:
-    import psutil
-
-    with subprocess.Popen(
-        words,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        encoding="utf-8",
-        errors="replace",
-        # Ctrl-C is the capture's: in a session of its own (POSIX), or a group (Windows).
-        start_new_session=True,
-        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
-    ) as process:
-        try:
-            text, _ = process.communicate(timeout=limit_s)
-        except subprocess.TimeoutExpired as fault:
-            with suppress(psutil.NoSuchProcess):
-                for started in psutil.Process(process.pid).children(recursive=True):
-                    started.kill()
-            process.kill()
-            raise TimeoutError(f"gave no answer within {limit_s:g} s") from fault
-    if process.returncode:
-        raise ValueError(f"exit code {process.returncode}: {one_line(text) or 'no output'}")
-    return text
 
 
 class _Port:

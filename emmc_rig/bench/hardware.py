@@ -19,20 +19,27 @@ from numpy.typing import NDArray
 
 from emmc_rig.bench.device_config import (
     CAMERA_PLUG_INS,
+    LIGHT_PLUG_INS,
     STAGE_PLUG_INS,
     AptConfig,
     CameraChoice,
+    CommandLightsConfig,
     GrblConfig,
     MicroManagerConfig,
+    MicroManagerLightsConfig,
     PluginConfig,
+    PluginLightsConfig,
     SerialConfig,
+    TextLightsConfig,
     ZaberConfig,
+    lights_of,
     open_plug_in,
     parse_camera,
     parse_stage,
     plug_ins,
     settings_of,
     stage_of,
+    stages_of_rig,
 )
 from emmc_rig.bench.environment import Source
 from emmc_rig.bench.hands import Attendant
@@ -46,6 +53,13 @@ from emmc_rig.drivers.dng import SMALLEST_SIDE_PX
 from emmc_rig.drivers.errors import DriverError, FirmwareError, TransportTimeoutError
 from emmc_rig.drivers.grbl import GrblStage
 from emmc_rig.drivers.grbl import identify as identify_grbl
+from emmc_rig.drivers.lights import (
+    CommandLights,
+    Exchange,
+    Lights,
+    MicroManagerLights,
+    TextLights,
+)
 from emmc_rig.drivers.ports import find_port, guess_of, list_serial_ports
 from emmc_rig.drivers.ptp import open_camera as open_ptp
 from emmc_rig.drivers.stage import HostStage, Stage, StageSettings
@@ -65,6 +79,7 @@ from emmc_rig.simulators.clock import ManualClock
 from emmc_rig.simulators.effects import Flaws
 from emmc_rig.simulators.firmware import SimulatedController
 from emmc_rig.simulators.grbl import LETTERS, GrblController
+from emmc_rig.simulators.lamp import LAMP_EXCHANGES, READY, ArduinoLamp
 from emmc_rig.simulators.ptp import ANY_EXPOSURE, THIRD_STOPS, PtpCameraSimulator, PtpUsbFunction
 from emmc_rig.simulators.u3v import U3vCameraSimulator
 from emmc_rig.simulators.usb import SimulatedUsb, UsbFunction
@@ -117,7 +132,8 @@ class Rig:
     axes are in a capture that no plan moves, as the focus. recorded_s: of a recording that is
     replayed, the exposure of each frame by its name. hands: axes that the stage has not, which the
     attendant moves; left: axes among these with the same place in every frame, which nobody moves.
-    sources: what is read beside every frame.
+    sources: what is read beside every frame. lights: what switches the light; None: the attendant
+    does.
     """
 
     stage: Stage
@@ -134,6 +150,17 @@ class Rig:
     hands: frozenset[str] = frozenset()
     left: frozenset[str] = frozenset()
     sources: tuple[Source, ...] = ()
+    lights: Lights | None = None
+
+    def set_lamp(self, colour: str) -> str:
+        """Light scene or board in this colour, or not for `off`.
+
+        Returns what the lights confirmed, "" where the attendant switches. Raises `LightError`.
+        """
+        if self.lights is not None:
+            return self.lights.set(colour)
+        self.attendant.set_lamp(colour)
+        return ""
 
 
 RigType = TypeVar("RigType", bound=Rig)
@@ -144,13 +171,14 @@ class Fitted:
     """Which of the four axes a simulated rig has, and those among them of a second controller.
 
     hands_um: how far, at most, a hand that moves the others puts them off their places. camera:
-    what its camera speaks, ptp or u3v.
+    what its camera speaks, ptp or u3v. lights: whether an Arduino switches its lamp, not a hand.
     """
 
     names: tuple[str, ...] = tuple(STAGE_AXES)
     second: tuple[str, ...] = ()
     hands_um: float = 0.0
     camera: str = "ptp"
+    lights: bool = False
 
 
 ALL_FITTED = Fitted()
@@ -158,10 +186,14 @@ ALL_FITTED = Fitted()
 
 @dataclass(frozen=True)
 class SimulatedRig(Rig):
-    """A rig, and the firmware of stage and camera (`still`), whose faults can be armed."""
+    """A rig, and the firmware of stage, camera and lamp, whose faults can be armed.
+
+    still: of the camera. lamp: None where a hand switches it.
+    """
 
     chain: ZaberChain = field(kw_only=True)
     still: PtpCameraSimulator | U3vCameraSimulator = field(kw_only=True)
+    lamp: ArduinoLamp | None = field(kw_only=True)
 
 
 class SimulatedAttendant:
@@ -342,6 +374,9 @@ def simulated_rig(
         digest = hashlib.blake2b(f"{seed} {name}".encode(), digest_size=8).digest()
         bench.rng = np.random.default_rng(int.from_bytes(digest))
 
+    lamp = ArduinoLamp(clock, bench.set_lamp) if fitted.lights else None
+    if lamp is not None and isinstance(simulator, U3vCameraSimulator):
+        simulator.lines["Line1"] = lamp.next_edge_s
     rig = SimulatedRig(
         stage,
         opened(),
@@ -353,8 +388,10 @@ def simulated_rig(
         announced,
         window_side_um(camera.views, camera.lens.aperture_cell_um),
         fixed_positions_um or {},
+        lights=None if lamp is None else simulated_lights(lamp, clock),
         chain=chain,
         still=simulator,
+        lamp=lamp,
     )
     return rig, bench
 
@@ -383,10 +420,13 @@ def open_stage(spec: str | Mapping[str, Any], settings: Mapping[str, Any] | None
     spec: `PROTOCOL:PORT` (zaber, grbl, apt, mm or a plug-in) or a YAML file, see
     `emmc_rig.bench.device_config`, or what such a file says;
     `simulated`, `simulated:grbl` or `simulated:apt` for a simulated one, whose time passes at
-    once. settings: single settings that replace those of the file.
-    Raises AppError or a `DriverError`.
+    once; or a rig's YAML file, for its stages. settings: single settings that replace those of the
+    file. Raises AppError or a `DriverError`.
     """
     if isinstance(spec, str):
+        named = stages_of_rig(spec)
+        if named is not None:
+            return open_stages(named)
         name, _, protocol = spec.partition(":")
         if name == SIMULATED:
             return open_simulated(protocol or "zaber", settings)[0]
@@ -529,11 +569,48 @@ def _found_axes(transport: Transport, clock: Clock) -> dict[str, tuple[int, int]
     return {f"{device}.{axis}": (device, axis) for device, axis in found}
 
 
-def open_camera(spec: str, clock: Clock = SYSTEM_CLOCK, backend: Any = None) -> CameraDevice:
+def open_lights(spec: Mapping[str, Any] | str, clock: Clock = SYSTEM_CLOCK) -> Lights:
+    """Return the lights that a rig's file describes, or `simulated` ones; they must be closed.
+
+    Raises AppError or a `DriverError`.
+    """
+    if isinstance(spec, str):
+        clock = ManualClock()
+        return simulated_lights(ArduinoLamp(clock), clock)
+    config = lights_of(spec, "lights")
+    if isinstance(config, TextLightsConfig):
+        exchanges = {colour: Exchange(x.send, x.expect) for colour, x in config.colours.items()}
+        wire = SerialTransport(config.port, config.limit_s, baud=config.baud)
+        try:
+            return TextLights(wire, exchanges, clock, config.ready, config.end)
+        except BaseException:
+            wire.close()
+            raise
+    if isinstance(config, CommandLightsConfig):
+        return CommandLights(config.colours, config.limit_s)
+    if isinstance(config, MicroManagerLightsConfig):
+        from emmc_rig.drivers.micromanager import load_core
+
+        states = config.colours or {"off": 0, "white": 1}
+        return MicroManagerLights(load_core(config.port), config.shutter, config.device, states)
+    assert isinstance(config, PluginLightsConfig)
+    return open_plug_in(LIGHT_PLUG_INS, config.protocol, config.port, clock, **config.options)
+
+
+def simulated_lights(lamp: ArduinoLamp, clock: Clock) -> Lights:
+    """Return the lights behind a simulated lamp's wire."""
+    exchanges = {colour: Exchange(**texts) for colour, texts in LAMP_EXCHANGES.items()}
+    return TextLights(lamp.transport(), exchanges, clock, READY)
+
+
+def open_camera(
+    spec: str | Mapping[str, Any], clock: Clock = SYSTEM_CLOCK, backend: Any = None
+) -> CameraDevice:
     """Open the camera that `spec` names: a driver, a colon and its address.
 
-    One of `drivers.cameras`, `simulated`, that of a plug-in, or a YAML file
-    (`emmc_rig.bench.device_config`). `backend`: of pyusb, for a simulated bus.
+    The driver is named in `drivers.cameras`, or by a plug-in, or is `simulated`. A camera may also
+    be named by its YAML file (`emmc_rig.bench.device_config`), or by the content of such a file.
+    `backend`: of pyusb, for a simulated bus.
     Raises AppError for any other driver, or the driver's error.
     """
     choice = parse_camera(spec)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
+from emmc_rig.bench.device_config import lights_of
 from emmc_rig.bench.environment import Source, SourceConfig
 from emmc_rig.bench.hands import Ask, AskingAttendant, NoAttendant
 from emmc_rig.bench.hardware import (
@@ -21,6 +22,7 @@ from emmc_rig.bench.hardware import (
     Rig,
     default_pupil,
     open_camera,
+    open_lights,
     open_stages,
     simulated_rig,
     whole_pupil,
@@ -62,13 +64,28 @@ class AnyRig(Settings):
     """What a rig's file may say of every rig.
 
     fixed_positions_um: positions of axes that no plan moves, such as `focus`. mask: its measured
-    mounting, which sessions keep. environment: sources that are read beside every frame.
+    mounting, which sessions keep. environment: sources that are read beside every frame. lights:
+    settings of the lights, see `emmc_rig.bench.device_config`, or `simulated`; None: a person
+    switches the lamp.
     """
 
     renamed: ClassVar = {"stands_um": "fixed_positions_um"}
     fixed_positions_um: dict[str, float] = Field(default_factory=dict)
     mask: Mounting | None = None
     environment: tuple[SourceConfig, ...] = ()
+    lights: dict[str, Any] | Literal["simulated"] | None = None
+
+    @field_validator("lights", mode="before")
+    @classmethod
+    def _lights_known(cls, lights: object) -> object:
+        if not isinstance(lights, dict):
+            return lights
+        try:
+            config = lights_of(lights, "")
+        except AppError as fault:
+            raise ValueError(str(fault).removeprefix(": ")) from fault
+        kept = config.model_dump(mode="json", exclude_defaults=True)
+        return {"protocol": config.protocol, **kept}
 
     @field_validator("environment")
     @classmethod
@@ -93,16 +110,17 @@ class RealRig(AnyRig):
 
     stage: as `--stage` of `emmc-rig devices`, or what its YAML file says, or a list of several;
     `none` where nothing moves. Its axes are called mask_x, mask_y, aperture_x, aperture_y, as many
-    of them as there are. camera: as its `--camera`. zero_um: place of each axis that centres the
-    mask or the pinhole of the aperture plate; of an axis that a hand moves, the reading of its
-    micrometer. window_um: aperture_x of the plate's open window, from there; window_side_um: side
-    of the window, for plans that open parts of the aperture. A recording (camera `folder:DIR`,
-    stage `simulated`) needs neither. by_hand: a person is asked for everything that no axis moves:
-    lamp, board, masks, pinhole; if false nothing of these changes, as in the replay of a recording.
+    of them as there are. camera: a name for its `--camera`, or the content of a camera's YAML file.
+    zero_um: place of each axis that centres the mask or the pinhole of the aperture plate; of an
+    axis that a hand moves, the reading of its micrometer. window_um: aperture_x of the plate's open
+    window, from there; window_side_um: side of the window, for plans that open parts of the
+    aperture. A recording (camera `folder:DIR`, stage `simulated`) needs neither. by_hand: a person
+    is asked for everything that no axis moves: board, masks, pinhole, and the lamp of a rig without
+    lights; if false nothing of these changes, as in the replay of a recording.
     """
 
     stage: StageSpec | list[StageSpec] = NO_STAGE
-    camera: str
+    camera: str | dict[str, Any]
     zero_um: dict[str, float] = Field(default_factory=dict)
     window_um: float = 0.0
     window_side_um: float | None = Field(default=None, gt=0)
@@ -125,6 +143,13 @@ class SimulatedAxes(AnyRig):
     hands_um: float = Field(default=0.0, ge=0)
     usb_camera: Literal["ptp", "u3v"] = "ptp"
     pupil: Pupil | Literal["round", "none"] | None = None
+
+    @field_validator("lights")
+    @classmethod
+    def _lights_of_the_bench(cls, lights: object) -> object:
+        if isinstance(lights, dict):
+            raise ValueError("the simulated bench has lights of its own: write lights: simulated")
+        return lights
 
     @field_validator("pupil", mode="before")
     @classmethod
@@ -199,8 +224,11 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
         more = {name: getattr(given, name) for name in LATER}
         return _described(SIMULATED, _of_now(imaged.model_copy(update=more)))
     described = _described("real", validated(RealRig, read, spec, AppError))
-    found = [_stage_file(stage, Path(spec).parent) for stage in _several(described["stage"])]
+    found = [_file_of_rig(stage, Path(spec).parent) for stage in _several(described["stage"])]
     described["stage"] = found if isinstance(described["stage"], list) else found[0]
+    camera = described["camera"]
+    if isinstance(camera, dict) or not Path(camera).is_file():
+        described["camera"] = _file_of_rig(camera, Path(spec).parent)
     return described
 
 
@@ -223,11 +251,11 @@ def _several(stages: StageSpec | list[StageSpec]) -> list[StageSpec]:
     return stages if isinstance(stages, list) else [stages]
 
 
-def _stage_file(stage: StageSpec, beside: Path) -> StageSpec:
-    """Return a stage, the name of a file that lies beside the rig's as a whole path."""
-    if isinstance(stage, str) and (beside / stage).is_file():
-        return str((beside / stage).resolve())
-    return stage
+def _file_of_rig(device: str | dict[str, Any], beside: Path) -> str | dict[str, Any]:
+    """Return a stage or camera, the name of a file that lies beside the rig's as a whole path."""
+    if isinstance(device, str) and (beside / device).is_file():
+        return str((beside / device).resolve())
+    return device
 
 
 def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:
@@ -330,14 +358,21 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
             replace(flaws, optics=replace(flaws.optics, pupil=_real_pupil(imaged, camera))),
             imaged.focus_um,
             imaged.fixed_positions_um,
-            Fitted(imaged.axes, imaged.second_stage, imaged.hands_um, imaged.usb_camera),
+            Fitted(
+                imaged.axes,
+                imaged.second_stage,
+                imaged.hands_um,
+                imaged.usb_camera,
+                imaged.lights is not None,
+            ),
         )
         _check_axes(imaged, rig)
         yield rig
         return
     real = validated(RealRig, settings, "the rig", AppError)
     zero_um = dict(real.zero_um)
-    if real.stage == SIMULATED and real.camera.startswith(RECORDING):
+    recorded = isinstance(real.camera, str) and real.camera.startswith(RECORDING)
+    if real.stage == SIMULATED and recorded:
         # Nothing moves any more, wherever the stage of the recording was sent.
         still: Stage = StillStage(
             (*STAGE_AXES, *real.fixed_positions_um), SYSTEM_CLOCK, 0.0, ANYWHERE_UM
@@ -345,7 +380,8 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
         zero_um = dict.fromkeys(STAGE_AXES, 0.0) | zero_um
     else:
         still = open_stages(_several(real.stage))
-    with still as stage, closing(open_camera(real.camera)) as device:
+    switched = nullcontext() if real.lights is None else closing(open_lights(real.lights))
+    with still as stage, switched as lights, closing(open_camera(real.camera)) as device:
         rig = Rig(
             stage,
             device,
@@ -357,6 +393,7 @@ def _opened_devices(description: Mapping[str, Any], camera: Camera, ask: Ask) ->
             reopen_camera=lambda: open_camera(real.camera),
             window_side_um=real.window_side_um,
             fixed_positions_um=real.fixed_positions_um,
+            lights=lights,
         )
         _check_axes(real, rig)
         yield rig

@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import count
 from typing import Any, NamedTuple
 
-from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig
+from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig, RigType
 from emmc_rig.captures.faults import FrameRefusedError, Mending
 from emmc_rig.captures.focus import FocusFound, focused, sharpness
 from emmc_rig.captures.metering import METERABLE_LEVELS, METERING_TRIES
 from emmc_rig.captures.plan import Plan
-from emmc_rig.drivers.errors import DriverError
+from emmc_rig.drivers.camera import Camera as CameraDevice
+from emmc_rig.drivers.errors import CameraSettingError, DriverError
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.drivers.stage import Stage, StageIdentity
 from emmc_rig.errors import AppError
@@ -41,12 +42,45 @@ def identity_of(stage: Stage, axis: str) -> StageIdentity:
         return StageIdentity()
 
 
+def with_trigger(rig: RigType, plan: Plan) -> RigType:
+    """Return the rig, the lines of its camera set as a plan says, also when it is opened again.
+
+    Raises AppError with one line if the camera lacks a line.
+    """
+    trigger, output, reopen = plan.trigger, plan.exposure_output, rig.reopen_camera
+    wanted: list[tuple[str, str, tuple]] = []
+    if trigger is not None:
+        wanted.append(("trigger", "set_trigger", (trigger.source, trigger.edge, trigger.limit_s)))
+    if output is not None:
+        wanted.append(("exposure_output", "set_exposure_output", (output,)))
+
+    def set_lines(camera: CameraDevice) -> CameraDevice:
+        for key, method, arguments in wanted:
+            try:
+                if not hasattr(camera, method):
+                    raise CameraSettingError(key, "does not exist, its driver knows no lines")
+                getattr(camera, method)(*arguments)
+            except CameraSettingError as fault:
+                remedy = f"change {key} in the plan, or leave it out"
+                raise AppError(f"{key}: {fault}: {remedy}") from fault
+        return camera
+
+    if not wanted:
+        return rig
+    set_lines(rig.camera)
+    return replace(rig, reopen_camera=None if reopen is None else lambda: set_lines(reopen()))
+
+
 @dataclass
 class Sent:
-    """What was last sent to the devices; empty: nothing is known."""
+    """What was last sent to the devices; empty: nothing is known.
+
+    lamp_read: what the lights confirmed.
+    """
 
     bench: tuple | None = None
     lamp: str | None = None
+    lamp_read: str = ""
     offsets_um: dict[str, float] = field(default_factory=dict)
     exposure_s: float | None = None
     gain: float | None = None
@@ -111,6 +145,8 @@ class Devices:
             with suppress(DriverError):
                 self.camera.close()
             self.camera = self._rig.reopen_camera()
+        if what.reconnect_lights and self._rig.lights is not None:
+            self._rig.lights.reconnect()
         if what.reconnect_stage:
             self._rig.stage.reconnect()
         if what.home:
@@ -146,7 +182,7 @@ class Devices:
         """Switch the lamp, unless it is so."""
         if self.sent.lamp != lamp:
             self.sent.lamp = None
-            self._rig.attendant.set_lamp(lamp)
+            self.sent.lamp_read = self._rig.set_lamp(lamp)
             self.sent.lamp = lamp
 
     def move(self, planned: PlannedFrame) -> bool:
@@ -259,7 +295,7 @@ class Devices:
 
     def facts(self) -> dict[str, Any]:
         """Return what the journal says of the devices of a run."""
-        stage, camera = self._rig.stage, self.camera
+        stage, camera, lights = self._rig.stage, self.camera, self._rig.lights
         settings = {}
         with suppress(DriverError):
             # Other values, such as the battery's, a camera may not report.
@@ -267,6 +303,9 @@ class Devices:
         return {
             "camera": {**asdict(camera.identity), "shape": list(camera.shape), "cfa": camera.cfa},
             "camera_settings": settings,
+            "lights": {}
+            if lights is None
+            else {"name": lights.name, "colours": list(lights.colours)},
             "stage": {
                 axis: {
                     "identity": asdict(identity_of(stage, axis)),

@@ -149,6 +149,8 @@ class Engine:
             run=self._recorder.run,
             plan=self._session.amendments,
             lamp=planned.bench.lamp,
+            triggered=self._plan.trigger is not None,
+            lamp_read=self.devices.sent.lamp_read,
             commanded_um=dict(planned.bench.offsets_um),
             figures=found,
             wall=self.devices.asked.wall,

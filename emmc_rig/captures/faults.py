@@ -18,10 +18,12 @@ from emmc_rig.drivers.errors import (
     DriverError,
     EmergencyStopError,
     FolderCameraError,
+    LightError,
     LimitExceededError,
     NotHomedError,
     PortError,
     PortPermissionError,
+    PressedSwitchError,
     SpeedLimitError,
     UnknownAxisError,
     UsbClaimedError,
@@ -111,9 +113,15 @@ def is_same(frame: NDArray[np.uint16], other: NDArray[np.uint16]) -> bool:
 
 
 def refuse_impossible(rig: Rig, frames: Iterable[PlannedFrame]) -> None:
-    """Raise AppError for the first frame that the stage cannot reach or the camera not expose."""
+    """Raise AppError for the first frame that stage, camera or lights cannot do."""
     exposures_s, gains = rig.camera.exposure_limits_s, rig.camera.gain_limits
     for frame in frames:
+        if rig.lights is not None and (colour := frame.bench.lamp) not in rig.lights.colours:
+            raise AppError(
+                f"frame {frame.id}: the rig's lights have no {colour}, only "
+                f"{', '.join(rig.lights.colours)}: name it under lights: in the rig's file, or "
+                f"leave {colour} light out of the plan"
+            )
         for axis, offset_um in frame.bench.offsets_um.items():
             if axis not in rig.hands | rig.left:
                 _refuse_place(rig, frame, axis, offset_um)
@@ -156,6 +164,7 @@ HOPELESS = (
     FolderCameraError,
     LimitExceededError,
     PortPermissionError,
+    PressedSwitchError,
     SaturatedError,
     SpeedLimitError,
     UnknownAxisError,
@@ -182,6 +191,7 @@ class Mending:
     """What to do before the next try."""
 
     wait_s: float
+    reconnect_lights: bool = False
     reconnect_stage: bool = False
     home: bool = False
     reopen_camera: bool = False
@@ -192,12 +202,22 @@ def mending(error: DriverError, attempt: int) -> Mending:
 
     A fault that only repeating has not cured is met by opening the camera again, every third time.
     """
+    if isinstance(error, LightError):
+        return Mending(_wait_s(attempt), reconnect_lights=True)
     lost = error.loses_position or isinstance(error, NotHomedError)
     port = isinstance(error, PortError)
     gone = isinstance(error, CAMERA_GONE)
     stubborn = attempt % 3 == 0 and not (lost or port)
-    wait_s = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2 ** (attempt - 1))
-    return Mending(wait_s, port, lost or port, gone or stubborn)
+    return Mending(
+        _wait_s(attempt),
+        reconnect_stage=port,
+        home=lost or port,
+        reopen_camera=gone or stubborn,
+    )
+
+
+def _wait_s(attempt: int) -> float:
+    return min(LONGEST_WAIT_S, FIRST_WAIT_S * 2 ** (attempt - 1))
 
 
 class Budget:

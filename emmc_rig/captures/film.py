@@ -43,6 +43,8 @@ ARRIVAL_POLL_S = 0.1
 """How soon a key counts while no frame comes."""
 SLOW_DISK = "the disk was too slow"
 NONE_CAME = "the camera sent no frame at that time"
+NO_PULSE = "no pulse came at that time, or the camera did not see it"
+SKIPPED = "the camera skipped the pulse: its frame numbers have a gap"
 LATE = "the bench was not ready at that time"
 SENT_TWICE = "identical to the frame before it"
 INTERRUPTED = "the film was interrupted"
@@ -95,12 +97,15 @@ class Arrived(NamedTuple):
 class Ring:
     """Frames on their way from a camera's stream to the disk, read by a thread of its own.
 
-    places: of the film, those to be filled. room: frames that may wait, 0 for any number. Use it in
-    a `with` block, which stops the camera.
+    places: of the film, those to be filled. room: frames that may wait, 0 for any number.
+    triggered: pulses give the rate. Use it in a `with` block, which stops the camera.
     """
 
-    def __init__(self, camera: Any, rate_hz: float, places: range, room: int) -> None:
+    def __init__(
+        self, camera: Any, rate_hz: float, places: range, room: int, triggered: bool = False
+    ) -> None:
         self._camera, self._rate_hz, self._places = camera, rate_hz, places
+        self._triggered, self._skipped = triggered, set[int]()
         self._frames: Queue[Arrived] = Queue(room)
         self._overflowed: set[int] = set()
         self._stopped = Event()
@@ -133,7 +138,11 @@ class Ring:
 
     def why_missing(self, place: int) -> str:
         """Return why there is no frame for a place before one that was returned."""
-        return SLOW_DISK if place in self._overflowed else NONE_CAME
+        if place in self._overflowed:
+            return SLOW_DISK
+        if self._triggered:
+            return SKIPPED if place in self._skipped else NO_PULSE
+        return NONE_CAME
 
     def _read(self) -> None:
         for place, sent in groupby(self._sent(), lambda frame: frame.place):
@@ -147,7 +156,7 @@ class Ring:
     def _sent(self) -> Iterator[Arrived]:
         """Yield what the camera sends until the film's time is over, at the nearest places."""
         camera, last = self._camera, self._places.stop - 1
-        paced = hasattr(camera, "stream_at")
+        paced = hasattr(camera, "stream_at") and not self._triggered
         place, first_s = self._places.start, None
         with closing(camera.stream_at(self._rate_hz) if paced else camera.stream()) as stream:
             for frame in stream:
@@ -157,6 +166,8 @@ class Ring:
                 first_s = at_s if first_s is None else first_s
                 passed = (at_s - first_s) * self._rate_hz
                 before, place = place, self._places.start + round(passed)
+                if int(frame.metadata.get("frames_lost", 0)):
+                    self._skipped |= {*range(before + 1, place)}
                 if place < before:
                     raise CaptureError("its time stamps run backwards", "open the camera again")
                 if place <= last:
@@ -240,7 +251,8 @@ class FilmRun:
         read_s, beside = -STAGE_READ_INTERVAL_S, dict[str, Any]()
         places = range(_place(first), _place(left[-1]) + 1)
         room = room_for(devices.camera, self._rig.clock)
-        with Ring(devices.camera, self._rate_hz, places, room) as ring:
+        triggered = self._plan.trigger is not None
+        with Ring(devices.camera, self._rate_hz, places, room, triggered) as ring:
             for arrived in ring:
                 if control.halting:
                     ring.stop()

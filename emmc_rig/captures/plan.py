@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     BeforeValidator,
@@ -18,10 +18,11 @@ from pydantic import (
 )
 
 from emmc_rig.errors import AppError
-from emmc_rig.formats.cameras import find_camera
-from emmc_rig.model.camera import Camera, Shot
 from emmc_rig.model.reading import read_yaml
 from emmc_rig.model.settings import Settings, validated
+
+if TYPE_CHECKING:
+    from emmc_rig.model.camera import Camera, Shot
 
 METERING_EXPOSURE_S = 0.01
 
@@ -218,6 +219,14 @@ class Focusing(Settings):
     span_um: Positive = Field(default=400.0, description="to either side of where the axis stands")
 
 
+class Trigger(Settings):
+    """A pulse on a line of the camera, as of the stage or the lamp, begins every frame."""
+
+    source: str = Field(min_length=1, description="the camera's name of the line, as Line1")
+    edge: Literal["rising", "falling"] = "rising"
+    limit_s: Positive = Field(default=10.0, description="a pulse that comes later is lost")
+
+
 class Film(Settings):
     """A film of the scene: frame after frame, each at its time, by the plan's shots in turn.
 
@@ -250,6 +259,12 @@ class Plan(Settings):
         default=None,
         description="module:function, called before every frame and after the last, see "
         "`emmc_rig.captures.between`",
+    )
+    trigger: Trigger | None = Field(
+        default=None, description="a line of the camera begins every frame; default: the program"
+    )
+    exposure_output: str | None = Field(
+        default=None, min_length=1, description="line of the camera that is high while it exposes"
     )
     focus: Focusing | None = Field(
         default=None, description=f"`{BEFORE_SHOTS}`, or when: needs an axis named focus"
@@ -295,7 +310,9 @@ class Plan(Settings):
 
 
 def load_plan(path: Path) -> Plan:
-    """Read a plan; raises AppError with one line naming the nearest valid key."""
+    """Read a plan; raises AppError for a missing file, or naming the nearest valid key."""
+    if not path.exists():
+        raise AppError(f"{path}: no such file; write a plan", "new-plan")
     return validated(Plan, read_yaml(path, AppError), str(path), AppError)
 
 
@@ -304,6 +321,8 @@ def planned_camera(plan: Plan, beside: Path | None = None) -> Camera:
 
     beside: the folder that a camera file is looked for in first. Raises AppError or CameraError.
     """
+    from emmc_rig.formats.cameras import find_camera  # takes a second to load
+
     spec = plan.camera
     if beside is not None and (beside / spec).is_file():
         spec = str(beside / spec)
@@ -421,6 +440,8 @@ darks:
 order: least-travel         # or as-planned
 settle_s: 0                 # after a move, beyond the stage's own
 # between: lab:hook         # a function in lab.py, called before every frame (docs: Hooks)
+# trigger: {{source: Line1}}  # pulses on this line of the camera begin the frames; edge: falling
+# exposure_output: Line2    # this line of the camera is high while it exposes
 # focus: before-shots       # the axis `focus` goes to where the scene is sharpest
 
 retries:

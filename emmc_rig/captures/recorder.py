@@ -92,6 +92,7 @@ class Recorder:
         self._session, self._watcher = session, watcher
         self._writer = Writer()
         self._began_s = 0.0
+        self._serial = ""
         self.run = 0
         # Frames that are stored, to be stored in all, and of these asked for once more.
         self._done = self._planned = self._retaken = 0
@@ -116,7 +117,7 @@ class Recorder:
         session = self._session
         session.make_ready()
         session.note(entry)
-        self.run = session.runs
+        self.run, self._serial = session.runs, entry.camera.get("serial", "")
         self.discard_damaged(session.stored)
         missing, self._planned = session.missing(), len(session.needed)
         self._done = self._planned - len(missing)
@@ -152,7 +153,7 @@ class Recorder:
     ) -> None:
         self.emit_step("write", planned)
         began_s = self.now_s()
-        file = frame_file(frame)
+        file = frame_file(frame, entry.wall, self._serial)
 
         def written() -> FrameEntry:
             spans = {**spans_s, "write": (began_s, self.now_s())}

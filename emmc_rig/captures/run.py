@@ -20,7 +20,7 @@ from emmc_rig.captures.amend import amendment
 from emmc_rig.captures.between import load_hook
 from emmc_rig.captures.by_hand import with_hands
 from emmc_rig.captures.control import Control, interruptible
-from emmc_rig.captures.devices import identity_of
+from emmc_rig.captures.devices import identity_of, with_trigger
 from emmc_rig.captures.events import Listener, OnEvent, RunEnd, emit_end
 from emmc_rig.captures.expand import expand
 from emmc_rig.captures.faults import GaveUpError, refuse_impossible
@@ -121,11 +121,11 @@ def asked_for(
         camera = validated(Camera, session.camera, str(path), CameraError)
         text, rig = session.plan_yaml, rig or session.rig
     else:
+        plan = load_plan(path)
         if rig is None and is_session(folder):
             rig = Session(folder).rig
         if rig is None:
             raise AppError("say which rig: simulated, or a YAML file of devices", "name-rig")
-        plan = load_plan(path)
         camera = planned_camera(plan, path.parent)
         text = path.read_text(encoding="utf-8")
     return CaptureRequest(path, plan, text, camera, folder, rig, until_db, other_devices)
@@ -145,7 +145,9 @@ def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session 
     if is_session(request.out):
         session = Session(request.out, disk)
         asked = json.loads(json.dumps(dict(request.rig)))
-        if session.stored and asked != AnyRig.under_new_names(session.rig):
+        begun = AnyRig.under_new_names(session.rig)
+        # How the lights are switched shows in no frame, and may be corrected.
+        if session.stored and asked | {"lights": None} != begun | {"lights": None}:
             raise AppError(
                 f"session {session.folder.name} was begun with another rig: "
                 f"{json.dumps(session.rig)}; name no rig, or begin another session"
@@ -308,6 +310,8 @@ def run_capture(request: CaptureRequest, front: FrontEnd) -> tuple[Session, RunE
                 f"focus: the rig has no axis named {FOCUS}, only {known}: name it so in the file "
                 "of the stage, or leave focus out of the plan"
             )
+        if recording is None:
+            rig = with_trigger(rig, plan)
         refuse_impossible(rig, frames)
         refuse_impossible_film(plan, rig, frames)
         if session is not None:
@@ -349,8 +353,6 @@ def capture_session(
     See `asked_for` and `run_capture`. Raises StoppedError when somebody stopped it: what was
     captured is kept, and the same call goes on.
     """
-    if not plan.exists():
-        raise AppError(f"{plan}: no such file; write a plan", "new-plan")
     folder = asked_folder(plan, out)
     with held(folder):
         request = asked_for(plan, folder, rig, until_db, other_devices)

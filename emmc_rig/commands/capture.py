@@ -23,9 +23,18 @@ from emmc_rig.commands.options import (
     RigSizeOption,
     out_option,
 )
-from emmc_rig.commands.output import emit, give_result, json_wanted, say, show_reason, tell
+from emmc_rig.commands.output import (
+    emit,
+    give_result,
+    json_wanted,
+    naming_stage,
+    say,
+    show_reason,
+    tell,
+)
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.progress import Event, Watcher
+from emmc_rig.store.folders import is_session
 
 if TYPE_CHECKING:
     from emmc_rig.captures.control import Control
@@ -108,6 +117,10 @@ def capture(
         return
     if plan is None:
         raise typer.BadParameter("name a plan, or write one by --new CAMERA")
+    from emmc_rig.captures.plan import load_plan
+
+    if not is_session(plan):
+        load_plan(plan)  # its faults are reported before a bench's modules load, for seconds
     from emmc_rig.bench.rig_config import SIMULATED, ImagedRig, rig_description
     from emmc_rig.model.settings import validated
     from emmc_rig.store.results import parse_psnr, parse_size
@@ -127,7 +140,8 @@ def capture(
     if not (page or steer):
         refuse(context, given_names(context) & {"host"}, "without --page or --steer")
     shown = None if not (page or steer) else "steers" if steer else "shows"
-    _run(plan, chosen, until_db, dry_run, out, shown, host, other_devices)
+    with naming_stage(rig or ""):
+        _run(plan, chosen, until_db, dry_run, out, shown, host, other_devices)
 
 
 def _write_plan(name: str, path: Path) -> None:

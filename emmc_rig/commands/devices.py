@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -17,8 +17,18 @@ from emmc_rig.captures.control import signals_interrupt
 from emmc_rig.commands.conform import conform
 from emmc_rig.commands.device_cameras import register, simulated_protocol
 from emmc_rig.commands.options import StageOption
-from emmc_rig.commands.output import give_result, say, show_table, shown_progress, tell
+from emmc_rig.commands.output import (
+    free_command,
+    give_result,
+    naming_stage,
+    on_stage,
+    say,
+    show_table,
+    shown_progress,
+    tell,
+)
 from emmc_rig.drivers.cameras import CAMERAS
+from emmc_rig.drivers.stage import Direction
 from emmc_rig.errors import AppError
 
 if TYPE_CHECKING:
@@ -28,7 +38,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="devices",
     no_args_is_help=True,
-    help="List, test and move stages and cameras.",
+    help="List, test and move stages, cameras and lights.",
 )
 
 RigOption = Annotated[
@@ -36,6 +46,12 @@ RigOption = Annotated[
     typer.Option("--rig", help="simulated, simulated:grbl or simulated:apt, instead of --stage"),
 ]
 AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (default: all)")]
+
+
+OFF_SWITCH_STEP_UM = 500.0
+"""A step off a limit switch; a switch's way is a few times as long."""
+MOST_STEPS_OFF_SWITCH = 10
+"""5 mm, further than a switch is pressed: then it is stuck, or the direction is wrong."""
 
 
 register(app)
@@ -169,11 +185,13 @@ def check(
         axes = opened.stage.axes
         hands = not isinstance(opened.attendant, NoAttendant)
         identity = opened.camera.identity
+        lights = "by hand" if opened.lights is None else ", ".join(opened.lights.colours)
         show_table(
             ("part", rig),
             [
                 ("stage axes", ", ".join(axes) or "none"),
                 ("camera", f"{identity.maker} {identity.model} {identity.serial}".strip()),
+                ("lights", lights if hands or opened.lights else "nothing (by_hand: false)"),
                 ("moved by hand", "what no axis moves" if hands else "nothing (by_hand: false)"),
             ],
         )
@@ -242,6 +260,34 @@ def _show_cameras(found: Sequence[Ability], axes: Sequence[str]) -> None:
 
 
 @app.command()
+def lights(
+    colour: Annotated[
+        str | None, typer.Argument(help="off, white, red, green or blue (default: list them)")
+    ] = None,
+    rig: Annotated[str, typer.Option("--rig", help="simulated, or the YAML file of a rig")] = "",
+) -> None:
+    """List a rig's lights, or switch them by hand; nothing moves."""
+    from emmc_rig.bench.hardware import SIMULATED, open_lights
+    from emmc_rig.bench.rig_config import ImagedRig, rig_description
+
+    if not rig:
+        raise typer.BadParameter("name the YAML file of a rig, or --rig simulated")
+    spec: Any = SIMULATED
+    if rig != SIMULATED:
+        spec = rig_description(rig, ImagedRig(scene="deep-occlusions")).get("lights")
+    if spec is None:
+        raise AppError(f"{rig}: has no lights: part, so that a person switches them: add one")
+    with shown_progress("lights"), closing(open_lights(spec)) as opened:
+        answer = "" if colour is None else opened.set(colour)
+        name, colours = opened.name, opened.colours
+    if colour is None:
+        show_table(("lights", "colours"), [(name, ", ".join(colours))])
+    else:
+        tell(f"{name}: {colour}, confirmed by {answer!r}")
+    give_result(lights=name, colours=list(colours), colour=colour, answer=answer)
+
+
+@app.command()
 def info(stage: StageOption = None, rig: RigOption = None) -> None:
     """Show a stage's axes: homed, position, limits, speed."""
     with _opened(stage, rig) as opened:
@@ -272,7 +318,7 @@ def jog(
     rig: RigOption = None,
 ) -> None:
     """Move an axis by a distance (-5: back), or to a position."""
-    from emmc_rig.drivers.errors import NotHomedError
+    from emmc_rig.drivers.errors import NotHomedError, PressedSwitchError
 
     with _opened(stage, rig) as opened:
         if speed_um_s is not None:
@@ -285,15 +331,87 @@ def jog(
             try:
                 at_um = move({axis: distance_um})[axis]
             except NotHomedError as fault:
+                for switched, away in pressed_switches(opened).items():
+                    raise PressedSwitchError(switched, away or "") from None
                 # After homing, a distance may lead out of the travel; a place within never does.
                 place_um = distance_um if to else sum(opened.limits_um(axis)) / 2
-                where = f"--rig {rig}" if stage is None else f"--stage {stage}"
+                words = f"{axis} {place_um:g} --to --home"
                 raise AppError(
-                    f"{fault.what}: home it in the same command, as `emmc-rig devices jog {axis} "
-                    f"{place_um:g} --to --home {where}`"
-                ) from fault
+                    f"{fault.what}: home it in the same command, as "
+                    f"`{on_stage('jog', words, rig or stage or '')}`"
+                ) from None
         tell(f"{axis} at {at_um:.3f} um")
         give_result(axis=axis, at_um=at_um)
+
+
+@app.command()
+def free(
+    axis: Annotated[str, typer.Argument(help="name of the axis")],
+    direction: Annotated[
+        Direction | None,
+        typer.Option("--direction", help="off the switch; up leads to larger positions"),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="do not ask before each step")] = False,
+    stage: StageOption = None,
+    rig: RigOption = None,
+) -> None:
+    """Move an axis off its limit switch, in slow steps of 0.5 mm, each after a question."""
+    with _opened(stage, rig) as opened:
+        pressed = pressed_switches(opened)
+        if axis not in pressed:
+            opened.limits_um(axis)  # of an axis that the stage has
+            tell(f"the stage reports no pressed limit switch of {axis}: nothing was moved")
+            give_result(axis=axis, pressed=False, moved_um=0.0)
+            return
+        named, switched = rig or stage or "", cast("Any", opened)
+        away = direction or pressed[axis] or _asked_direction(axis, named, yes)
+        for steps in range(1, MOST_STEPS_OFF_SWITCH + 1):
+            question = f"Move {axis} {away} by {OFF_SWITCH_STEP_UM / 1e3:g} mm?"
+            if not yes and not typer.confirm(question, err=True):
+                raise AppError(f"{axis} still stands on its limit switch")
+            moved_um = away.sign * steps * OFF_SWITCH_STEP_UM
+            # The release of the switch is an alarm, which is no news here.
+            with _errors_only(logging.getLogger("emmc_rig.drivers")):
+                released = switched.move_off_switch(axis, away, OFF_SWITCH_STEP_UM)
+            if released:
+                left = [other for other in pressed_switches(opened) if other != axis]
+                then = free_command(left[0], named) if left else on_stage("home", "", named)
+                tell(f"{axis} is off its limit switch after {moved_um / 1e3:+g} mm; next: `{then}`")
+                give_result(axis=axis, pressed=False, moved_um=moved_um)
+                return
+        raise AppError(
+            f"the switch of {axis} is still pressed after {moved_um / 1e3:+g} mm: look whether the "
+            "axis moves away from it, and whether the switch or its wiring is stuck (Grbl: $5 says "
+            "which level counts as pressed)"
+        )
+
+
+def pressed_switches(stage: Stage) -> dict[str, Direction | None]:
+    """Return the axes on a limit switch, and the direction off it; {}: none, or not reported."""
+    return getattr(stage, "pressed_switches", dict)()
+
+
+def _asked_direction(axis: str, named: str, yes: bool) -> Direction:
+    """Return the direction that leads off a switch, from a person; raises AppError without one.
+
+    named: the stage, as it was named. yes: nobody is there to be asked.
+    """
+    unknown = (
+        f"{axis} stands on a limit switch, and the controller does not report at which end of the "
+        "travel"
+    )
+    if not yes:
+        say("note", f"{unknown}: look where it stands")
+        try:
+            question = "Up or down: which direction leads off the switch"
+            return Direction(typer.prompt(question, type=Direction, err=True))
+        except typer.Abort:  # no terminal to ask at
+            pass
+    ways = " or ".join(f"`{free_command(axis, named, way)}`" for way in Direction)
+    raise AppError(
+        f"{unknown}: look where it stands, then move it up from the lower end or down from the "
+        f"upper end, by {ways}"
+    )
 
 
 @app.command("udev-rule")
@@ -316,7 +434,8 @@ def _opened(stage: str | None, rig: str | None) -> Iterator[Stage]:
     logging.basicConfig(format="emmc-rig: %(message)s", level=logging.WARNING)
     with signals_interrupt(), open_stage(rig or stage or "") as opened:
         try:
-            yield opened
+            with naming_stage(rig or stage or ""):
+                yield opened
         except KeyboardInterrupt as stop:
             notes = getattr(stop, "__notes__", ["the stage was stopped"])
             say("stopped", "; ".join(notes))

@@ -187,8 +187,9 @@ def _devices_of_rig(
     imaged = ImagedRig(scene=scene, size=parse_size(size), real_time=True)
     opened = stack.enter_context(opened_rig(rig_description(rig, imaged), design, _nobody))
     place, targets = None, ()
+    if isinstance(opened, SimulatedRig) or opened.lights is not None:
+        opened.set_lamp("white")
     if isinstance(opened, SimulatedRig):
-        opened.attendant.set_lamp("white")
         open_um = {"aperture_x": opened.window_um, "aperture_y": 0.0}
         by_hand = {axis: um for axis, um in open_um.items() if axis not in opened.stage.axes}
         opened.attendant.move(by_hand)

@@ -97,7 +97,8 @@ HostOption = Annotated[
 StageOption = Annotated[
     str | None,
     typer.Option(
-        "--stage", help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or a YAML file"
+        "--stage",
+        help="zaber:PORT, grbl:PORT, apt:PORT, PLUG-IN:ADDRESS, or the YAML file of a stage or rig",
     ),
 ]
 RigOption = Annotated[

@@ -41,7 +41,14 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from emmc_rig.drivers.errors import AxisFaultError, NotHomedError, PositionMismatchError
+from emmc_rig.drivers.errors import (
+    ALL_AXES,
+    AxisFaultError,
+    DriverError,
+    NotHomedError,
+    PositionMismatchError,
+    PressedSwitchError,
+)
 from emmc_rig.model.errors import AdvisedError
 from emmc_rig.progress import Watcher
 
@@ -66,7 +73,6 @@ WORDS = {
     "list-formats": "`emmc-rig export --list` marks them",
 }
 """What helps against an error, by its `Advice`, in words of the command line."""
-HOME = "home by `emmc-rig devices home {about} --stage STAGE`"
 TO_HOME = (NotHomedError, AxisFaultError, PositionMismatchError)
 VERDICT_COLOURS = {"trust": "green", "cannot tell": "cyan", "doubt": "yellow", "do not use": "red"}
 
@@ -167,9 +173,41 @@ def _typed(fault: BaseException | None) -> Iterator[str]:
     while fault is not None:
         if isinstance(fault, AdvisedError) and fault.advice is not None:
             yield WORDS[fault.advice].format(about=shlex.quote(str(fault.about)))
-        if isinstance(fault, TO_HOME):
-            yield HOME.format(about=fault.axis)
+        if isinstance(fault, PressedSwitchError):
+            yield f"free it by `{free_command(fault.axis, fault.stage, fault.away)}`"
+        elif isinstance(fault, TO_HOME):
+            axes = "" if fault.axis == ALL_AXES else fault.axis
+            yield f"home by `{on_stage('home', axes, fault.stage)}`"
         fault = fault.__cause__
+
+
+@contextmanager
+def naming_stage(stage: str) -> Iterator[None]:
+    """Let a driver's error, and what it causes, carry how its stage was named on the command line.
+
+    The advice against the error then names the same stage.
+    """
+    try:
+        yield
+    except Exception as error:
+        fault: BaseException | None = error
+        while fault is not None:
+            if isinstance(fault, DriverError):
+                fault.about(stage=stage)
+            fault = fault.__cause__
+        raise
+
+
+def free_command(axis: str, stage: str, away: str = "") -> str:
+    """Return the command that moves an axis off its limit switch. away: up or down, if known."""
+    return on_stage("free", f"{axis} --direction {away}" if away else axis, stage)
+
+
+def on_stage(command: str, arguments: str, stage: str) -> str:
+    """Return a command of `emmc-rig devices` for a stage. stage: as it was named, "" if unknown."""
+    option = "--rig" if stage.startswith("simulated") else "--stage"
+    words = ("emmc-rig devices", command, arguments, option, shlex.quote(stage or "STAGE"))
+    return " ".join(filter(None, words))
 
 
 class Shown(Watcher):

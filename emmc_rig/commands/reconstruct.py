@@ -20,6 +20,7 @@ from emmc_rig.commands.options import (
     out_option,
 )
 from emmc_rig.commands.output import give_result, say, show_verdict, shown_progress, tell
+from emmc_rig.store.folders import WRITTEN_BY, refuse_missing
 
 if TYPE_CHECKING:
     from emmc_rig.process.captures import Capture
@@ -80,6 +81,8 @@ def reconstruct(
     out: Annotated[Path | None, out_option("in a session, else emmc-reconstruction")] = None,
 ) -> None:
     """Reconstruct light fields from frames, or a film of them, with a verdict."""
+    if frames is not None and len(frames) == 1:
+        refuse_missing(frames[0], WRITTEN_BY)  # before the methods load, for a second
     from emmc_rig.process.captures import opened_capture
     from emmc_rig.process.cost import method_within, parse_memory
     from emmc_rig.process.reconstructing import load_settings, reconstruct_captures

@@ -4,7 +4,8 @@ Every path begins with a random token, and the host must be one of this computer
 itself, so that no other page in the browser can reach it (cross-site requests, DNS rebinding).
 
 States are pushed (server-sent events), the newest only. A request that must not wait has a thread
-of its own.
+of its own. Connections are few and requests have a time limit, so that a page leaves file
+descriptors to the capture beside it, whatever a browser or a stranger does.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import asyncio
 import json
 import secrets
 import socket
+import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +31,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.live.served_page import Page, Picture
@@ -38,6 +41,15 @@ from emmc_rig.report.page import ENVIRONMENT, TEMPLATES
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]")
 EVERYWHERE = ("0.0.0.0", "::")
 PATIENCE_S = 10.0
+REQUEST_S = 5.0
+"""From connecting, or from an answer, until a whole request has arrived."""
+READING_S = 20.0
+"""An answer of which a client has read nothing for so long is given up, on Linux by its kernel."""
+LAST_STATE_S = 1.0
+MOST_CONNECTIONS = 128
+"""An eighth of the 1,024 files that Linux lets a program open; a browser opens six."""
+MOST_WAITING = 64
+"""Connections taken at once, before the first of them is counted."""
 LONGEST_BODY = 1 << 17
 PAUSE_S = 0.04
 """At least between two states that are pushed."""
@@ -135,6 +147,8 @@ def application(
 
     async def shown(request: Request) -> Response:
         name = request.path_params.get("name", "") or page.files[0]
+        if request.method != "GET":
+            raise HTTPException(405, f"{name!r} takes no POST: an order is at do/ORDER")
         if name in page.pictures:
             wanted = page.pictures[name](request.query_params)
             if wanted is None:
@@ -192,7 +206,7 @@ def application(
             Route("/{token}/events", guarded(events), methods=["GET"]),
             Route("/{token}/do/{order}", guarded(act), methods=["GET", "POST"]),
             Route("/{token}/", guarded(shown), methods=["GET"]),
-            Route("/{token}/{name}", guarded(shown), methods=["GET"]),
+            Route("/{token}/{name:path}", guarded(shown), methods=["GET", "POST"]),
             Route("/{rest:path}", guarded(shown), methods=["GET", "POST"]),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
@@ -205,12 +219,44 @@ def listening_socket(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
     """Return a socket to serve at; raises AppError where that is not possible."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family)
+        listening = socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as fault:
         why = getattr(fault, "strerror", None) or str(fault)
         raise AppError(
             f"cannot serve at {host} port {port} ({why}): choose another port or host"
         ) from fault
+    if sys.platform == "linux":  # accepted connections inherit it
+        waited_ms = round(1e3 * READING_S)
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, waited_ms)
+    return listening
+
+
+class Connection(H11Protocol):
+    """A connection that is closed if too many are open, or if no whole request comes in time."""
+
+    _time_limit: asyncio.TimerHandle
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore
+        """Begin to wait for the first request."""
+        super().connection_made(transport)
+        self._time_limit = self.loop.call_later(REQUEST_S, self._close_without_request)
+        if len(self.connections) > MOST_CONNECTIONS:
+            transport.abort()
+
+    def on_response_complete(self) -> None:
+        """Begin to wait for the next request."""
+        self._time_limit.cancel()
+        self._time_limit = self.loop.call_later(REQUEST_S, self._close_without_request)
+        super().on_response_complete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait for no request any more."""
+        self._time_limit.cancel()
+        super().connection_lost(exc)
+
+    def _close_without_request(self) -> None:
+        if self.cycle is None or self.cycle.more_body or self.cycle.response_complete:
+            self.transport.close()
 
 
 class Server(uvicorn.Server):
@@ -220,20 +266,28 @@ class Server(uvicorn.Server):
         super().__init__(
             uvicorn.Config(
                 app,
-                http="h11",
-                log_level="warning",
+                http=Connection,
+                backlog=MOST_WAITING,
+                # Warnings are about requests that no browser sends: a flood would fill the log.
+                log_level="error",
                 access_log=False,
                 lifespan="off",
                 server_header=False,
-                timeout_graceful_shutdown=1,
+                timeout_graceful_shutdown=round(2 * LAST_STATE_S),
             )
         )
         self._ending: asyncio.Event = app.state.ending
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End what is pushed, then what else is under way."""
+        """Push the last state; a client that has not read it after `LAST_STATE_S` is cut off."""
         self._ending.set()
+        asyncio.get_running_loop().call_later(LAST_STATE_S, self._close_all)
         await super().shutdown(sockets)
+
+    def _close_all(self) -> None:
+        for connection in list(self.server_state.connections):
+            assert isinstance(connection, Connection)
+            connection.transport.abort()
 
 
 @contextmanager
@@ -241,7 +295,8 @@ def served(app: Starlette, host: str = "127.0.0.1") -> Iterator[int]:
     """Serve in a thread of its own until the block ends; yield the port. Raises AppError."""
     with listening_socket(host) as listening:
         server = Server(app)
-        thread = Thread(target=server.run, kwargs={"sockets": [listening]}, name="live server")
+        sockets = {"sockets": [listening]}
+        thread = Thread(target=server.run, kwargs=sockets, name="live server", daemon=True)
         thread.start()
         try:
             yield listening.getsockname()[1]
@@ -255,10 +310,11 @@ async def _body(request: Request) -> dict[str, Any]:
     if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
         raise HTTPException(415, "send JSON")
     data = b""
-    async for chunk in request.stream():
-        data += chunk
-        if len(data) > LONGEST_BODY:
-            raise HTTPException(413, f"more than {LONGEST_BODY} bytes")
+    async for chunk in request.stream():  # to its end: an earlier answer can be lost on its way
+        if len(data) <= LONGEST_BODY:
+            data += chunk
+    if len(data) > LONGEST_BODY:
+        raise HTTPException(413, f"more than {LONGEST_BODY} bytes")
     try:
         values = parse_json(data or b"{}", "the request", ValueError)
     except ValueError as fault:

@@ -31,15 +31,13 @@ from emmc_rig.drivers.raw import captured_at
 from emmc_rig.errors import AppError
 from emmc_rig.progress import Watcher
 from emmc_rig.session.board_sets import decoded
-from emmc_rig.session.frame_file import dng_of
+from emmc_rig.session.frame_file import dng_of, iso_of
 from emmc_rig.session.journal import FrameEntry, ImportedEntry, RunEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import CAMERA, RIG, Session
 from emmc_rig.store.folders import new_file, result_folder
 
 AXES = {"mask": ("mask_x", "mask_y"), "aperture": ("aperture_x", "aperture_y")}
-BASE_ISO = 100
-"""At gain 1, where a camera does not say: what most sensors are nearest to."""
 UNITS = {"count_time": "s", "black_level": "DN", "saturation_value": "DN", "data": "DN"}
 """Of numbers; places are in um."""
 
@@ -90,8 +88,8 @@ def export_hdf5(
 def export_dng(session: Session, folder: Path, watcher: Watcher | None = None) -> None:
     """Write every stored frame as a DNG with its facts into a folder, named as in the session.
 
-    Its mosaic as the camera gave it, levels in whole DN. Exposure, ISO (100 at gain 1 where the
-    camera says none), the time of exposure to the millisecond, maker, model, serial number, and as
+    Its mosaic as the camera gave it, levels in whole DN. Exposure, ISO (where the camera states
+    it), the time of exposure to the millisecond, maker, model, serial number, and as
     ImageUniqueID the session's id followed by 16 digits of the frame's own. Every frame's digest is
     checked on the way. Raises AppError where a frame is not good, or nothing can be written.
     """
@@ -109,7 +107,7 @@ def export_dng(session: Session, folder: Path, watcher: Watcher | None = None) -
             keys = ("maker", "model", "serial")
             maker, model, serial = (named.get(key) or line.metadata.get(key, "") for key in keys)
             facts = Facts(
-                _iso(line, imported),
+                iso_of(line.metadata),
                 _captured(line, imported),
                 f"session {session.id}, frame {planned.id}",
                 f"{session.id}{line.sha256[:16]}",
@@ -119,14 +117,6 @@ def export_dng(session: Session, folder: Path, watcher: Watcher | None = None) -
             data = dng_of(frame, identity, facts=facts)
             (new / line.file).with_suffix(".dng").write_bytes(data)
             watcher.step(planned.id)
-
-
-def _iso(line: FrameEntry, imported: bool) -> int | None:
-    """Return what the camera says; else, of a frame captured here, what its gain amounts to."""
-    told = str(line.metadata.get("iso", ""))
-    if told.isdecimal() and int(told):
-        return int(told)
-    return None if imported else round(BASE_ISO * line.gain)
 
 
 def _captured(line: FrameEntry, imported: bool) -> datetime | None:

@@ -8,7 +8,9 @@ the camera's bytes are decoded and compared with the frame.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from emmc_rig.drivers.camera import CameraIdentity
 from emmc_rig.drivers.cameras import CAMERAS
 from emmc_rig.drivers.dng import LARGEST_TILE, Facts, encode_dng, private_data
 from emmc_rig.drivers.errors import DriverError, RawFrameError
-from emmc_rig.drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, decode_raw
+from emmc_rig.drivers.raw import RAW_SUFFIXES, TIFF_MAGICS, RawFrame, captured_at, decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.session.journal import Figures, FrameEntry
 
@@ -70,10 +72,18 @@ def frame_entry(frame: RawFrame, exposure_s: float, gain: float, **about: Any) -
     return FrameEntry(id="", file="", bytes=0, sha256="", **known, **about)
 
 
-def frame_file(frame: RawFrame) -> FrameFile:
+def iso_of(metadata: Mapping[str, Any]) -> int | None:
+    """Return the ISO that the camera states with a frame."""
+    stated = str(metadata.get("iso", ""))
+    return int(stated) if stated.isdecimal() and int(stated) else None
+
+
+def frame_file(frame: RawFrame, wall: str = "", serial: str = "") -> FrameFile:
     """Return the file from which `decode_frame` returns the frame.
 
-    Raises AppError for a frame that no file can hold.
+    wall, serial: the time of exposure as `FrameEntry` has it, and the camera's serial number, for a
+    DNG that is made here; time and number in the frame's metadata come first. Raises AppError for a
+    frame that no file can hold.
     """
     suffix = Path(frame.metadata.get("name", "")).suffix.lower()
     if suffix not in RAW_SUFFIXES:
@@ -81,8 +91,13 @@ def frame_file(frame: RawFrame) -> FrameFile:
     own = FrameFile(suffix, frame.original, frame.sha256)
     if _decodes_to(own, frame):
         return own
-    identity = CameraIdentity(frame.metadata.get("maker", ""), frame.metadata.get("model", ""))
-    data = dng_of(frame, identity, frame.original)
+    stated = frame.metadata
+    identity = CameraIdentity(
+        stated.get("maker", ""), stated.get("model", ""), stated.get("serial", serial)
+    )
+    asked = datetime.fromisoformat(wall) if wall else None
+    facts = Facts(iso_of(stated), captured_at(stated) or asked)
+    data = dng_of(frame, identity, frame.original, facts)
     made = FrameFile(".dng", data, hashlib.sha256(data).hexdigest(), frame.sha256)
     if not _decodes_to(made, frame):
         raise AppError(f"{UNSTORABLE} (a DNG of it decodes to something else)")

@@ -104,6 +104,8 @@ class RunEntry(TimedEntry):
     camera_settings: dict[str, Any] = {}
     stage: dict[str, Any] = {}
     """By axis: identity, limits_um, speed_um_s and zero_um."""
+    lights: dict[str, Any] = {}
+    """Name and colours of what switches the lamp; {}: a person."""
     environment: dict[str, str] = {}
     """Units of what is read beside the frames, by name."""
     between: dict[str, str] = {}
@@ -163,6 +165,8 @@ class FrameEntry(Entry):
     """Of the camera's own bytes, where `file` is a DNG of the mosaic that holds them."""
     lamp: str = ""
     """Colour of the lamp, or "off"."""
+    lamp_read: str = ""
+    """What the lights confirmed when they were last set; "" where a person switches the lamp."""
     commanded_um: dict[str, float] = {}
     """Planned place of each axis, um from its zero."""
     read_um: dict[str, float] = {}

@@ -194,6 +194,10 @@ def _free(path: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
+WRITTEN_BY = "name a session, or the folder of simulated frames"
+"""Remedy for a folder without frames."""
+
+
 def refuse_missing(folder: Path, remedy: str) -> None:
     """Raise AppError, with the remedy, where the folder is missing."""
     if not folder.exists():

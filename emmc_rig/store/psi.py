@@ -14,7 +14,7 @@ from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, PsiLayout, checksum_of
 from emmc_rig.model.view_axes import ATTRIBUTE, axes_from, stored_as
-from emmc_rig.store.folders import refuse_missing
+from emmc_rig.store.folders import WRITTEN_BY, refuse_missing
 from emmc_rig.store.shards import CHUNK, SHARD, created_group, missing_value, stored_in
 
 PSI_GROUP = "psi.zarr"
@@ -22,7 +22,6 @@ AGAIN = "measure Psi again"
 FRAMES, PSI = "frames.h5", "psi.h5"
 FRAMES_GROUP = "frames.zarr"
 FRAMES_AGAIN = "make the frames again"
-WRITTEN_BY = "name a session, or the folder of simulated frames"
 
 
 class StoredPsi(PsiLayout):

@@ -94,7 +94,7 @@ def _finite(value: object) -> object:
 def stated_words(metrics: Mapping[str, object]) -> str:
     """Return "31.2 dB (29.8 to 33.0 in 9 of 10 captures)" by metrics.json; "" without it.
 
-    Of a place that is worse by FAR_DB, "24.1 dB about row 40, column 66" follows.
+    With "least accurate about row 40, column 66: 24 dB" where that place is worse by FAR_DB.
     """
     stated_db, interval = metrics.get("stated_db"), metrics.get("stated_interval_db")
     if not isinstance(stated_db, float):
@@ -105,7 +105,7 @@ def stated_words(metrics: Mapping[str, object]) -> str:
             words += f" ({low:.1f} to {high:.1f} in 9 of 10 captures)"
     match metrics.get("stated_worst_db"), metrics.get("stated_worst_at"):
         case float(worst_db), [int(row), int(column)] if worst_db < stated_db - FAR_DB:
-            words += f"; least, {worst_db:.1f} dB, about row {row}, column {column}"
+            words += f"; least accurate about row {row}, column {column}: {worst_db:.0f} dB"
     return words
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 from programs import PROGRAM
 
-from emmc_rig.bench.hardware import open_camera, open_stage
-from emmc_rig.drivers.errors import LimitExceededError
+from emmc_rig.bench.hardware import open_camera, open_lights, open_stage
+from emmc_rig.bench.rig_config import ImagedRig, opened_rig, rig_description
+from emmc_rig.drivers.errors import LightError, LimitExceededError
 from emmc_rig.errors import AppError
+from emmc_rig.formats.cameras import find_camera
 
 EXAMPLE = Path(__file__).parents[2] / "docs/example_plugin"
 BROKEN = """
@@ -77,6 +79,20 @@ def test_a_stage_of_a_plug_in_is_opened_by_name_with_our_settings(installed, tmp
             stage.move_to_um({"x": 501.0})
 
 
+def test_lights_of_a_plug_in_take_their_options_from_the_rigs_file(installed, tmp_path):
+    file = tmp_path / "brightness"
+    spec = {"protocol": "dimmer", "port": str(file), "options": {"level": 200}}
+    with closing(open_lights(spec)) as lights:
+        assert lights.set("white") == "200"
+        assert file.read_text() == "200\n"
+        file.unlink()
+        file.mkdir()
+        with pytest.raises(LightError, match=r"cannot be set to off .*Is a directory"):
+            lights.set("off")
+    with pytest.raises(AppError, match=r"plug-in dimmer \(emmc_rig_example 1.0\).*'levl'"):
+        open_lights(spec | {"options": {"levl": 3}})
+
+
 def test_a_camera_of_a_plug_in_takes_its_options_from_a_file(installed, tmp_path):
     program = tmp_path / "take.py"
     program.write_text(
@@ -92,6 +108,17 @@ def test_a_camera_of_a_plug_in_takes_its_options_from_a_file(installed, tmp_path
     with closing(open_camera(str(file))) as camera:
         camera.set_exposure_s(0.02)
         assert camera.snap().mosaic.shape == (30, 40)
+    # Also in the rig's file itself, or beside it.
+    rig = tmp_path / "rig.yaml"
+    for camera in (file.read_text(), "camera.yaml"):
+        rig.write_text(f"{{camera: {camera}, by_hand: false}}")
+        described = rig_description(str(rig), ImagedRig(scene="near-planar"))
+        with opened_rig(described, find_camera("rgbw-bayer-1shot"), pytest.fail) as opened:
+            assert opened.camera.shape == (30, 40)
+    rig.write_text("{camera: {file: frame.dng}}")
+    described = rig_description(str(rig), ImagedRig(scene="near-planar"))
+    with pytest.raises(AppError, match="the rig's camera: name the camera's driver, such as"):
+        open_camera(described["camera"])
     file.write_text("{kind: command, address: x, flie: frame.dng}")
     with pytest.raises(AppError, match=r"plug-in command \(emmc_rig_example 1.0\).*'flie'"):
         open_camera(str(file))

@@ -10,8 +10,15 @@ import pytest
 import typer
 
 from emmc_rig import cli
-from emmc_rig.commands.output import HOME, WORDS, in_shell
-from emmc_rig.drivers.errors import LimitExceededError, NotHomedError, StalledError
+from emmc_rig.commands.output import WORDS, free_command, in_shell, naming_stage, on_stage
+from emmc_rig.drivers.errors import (
+    ALL_AXES,
+    LimitExceededError,
+    LostPositionError,
+    NotHomedError,
+    PressedSwitchError,
+    StalledError,
+)
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import Advice
 
@@ -76,7 +83,8 @@ def test_the_command_line_words_every_advice_by_commands_and_flags_that_there_ar
         *(member for group in groups for member in group.commands.values()),
     ]
     flags = {flag for command in every for parameter in command.params for flag in parameter.opts}
-    for words in (*WORDS.values(), HOME):
+    on_stages = (on_stage("home", "x", ""), free_command("x", "simulated", "up"))
+    for words in (*WORDS.values(), *on_stages):
         assert set(re.findall(r"--[a-z-]+", words)) <= flags
         assert all(name in COMMANDS for name in re.findall(r"emmc-rig (\w+)", words))
 
@@ -90,6 +98,13 @@ def test_the_command_line_words_every_advice_by_commands_and_flags_that_there_ar
         (LimitExceededError("mask_x", 9, (0, 1)), "mask_x cannot go to 9 um: choose 0 to 1 um"),
         (NotHomedError("mask_x"), "mask_x does not know where it is: home it first; "
          "home by `emmc-rig devices home mask_x --stage STAGE`"),
+        (LostPositionError(ALL_AXES, "it restarted", "home the axes"),
+         "every axis reports a fault, it restarted: home the axes; "
+         "home by `emmc-rig devices home --stage STAGE`"),
+        (PressedSwitchError("mask_x", "down"),
+         "mask_x reports a fault, it stands on its limit switch: move it off the switch, "
+         "downwards, before it is homed; "
+         "free it by `emmc-rig devices free mask_x --direction down --stage STAGE`"),
     ],
 )  # fmt: skip
 def test_an_error_is_shown_with_what_to_type(fault, line):
@@ -100,3 +115,11 @@ def test_the_advice_of_an_error_is_shown_with_the_one_that_it_caused():
     caused = AppError("frame 3: the stage stopped")
     caused.__cause__ = StalledError("mask_y")
     assert in_shell(caused).endswith("`emmc-rig devices home mask_y --stage STAGE`")
+
+
+def test_the_advice_names_the_stage_as_the_command_did():
+    caused = AppError("the capture stopped")
+    caused.__cause__ = PressedSwitchError("mask_y")
+    with pytest.raises(AppError), naming_stage("my rig.yaml"):
+        raise caused
+    assert in_shell(caused).endswith("`emmc-rig devices free mask_y --stage 'my rig.yaml'`")

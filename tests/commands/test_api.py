@@ -545,3 +545,20 @@ def test_a_verdict_is_one_sentence(taken):
     assert str(verdict) == verdict.words
     assert str(verdict).startswith(f"{verdict.level}: ")
     assert len(repr(verdict)) < 60
+
+
+@pytest.mark.parametrize(
+    "arguments", [("capture", "missing.yaml"), ("capture", "plan.yaml"), ("reconstruct", "missing")]
+)
+def test_a_mistake_in_a_name_or_plan_is_reported_before_heavy_packages_load(tmp_path, arguments):
+    (tmp_path / "plan.yaml").write_text("camera: rgbw-bayer-2shots\nshot: []\n")
+    code = (
+        f"import sys; sys.argv = ['emmc-rig', *{arguments}]\n"
+        "from emmc_rig.cli import main\n"
+        "try: main()\n"
+        "finally: print(*sorted({'numba', 'scipy', 'cv2', 'matplotlib'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (1, "\n"), done.stderr

@@ -1,5 +1,6 @@
 """`emmc-rig devices`: alike on simulated and real stages, stopped by every interruption."""
 
+import io
 import os
 import re
 import signal
@@ -15,6 +16,7 @@ import pytest
 import yaml
 from programs import PROGRAM, done, one_line, wait_until
 from serial.tools import list_ports
+from stage_rigs import QUICK_HOMING
 
 from emmc_rig.bench.device_config import parse_stage
 from emmc_rig.bench.hardware import SIMULATED_SCALES, open_stage, probe_port
@@ -78,6 +80,66 @@ def test_an_axis_that_is_not_homed_is_told_a_command_that_succeeds(run):
     advised = one_line(err).split("`")[1].split()
     assert advised[:2] == ["emmc-rig", "devices"]
     assert run(*advised[2:])[0] == 0
+
+
+@pytest.fixture
+def on_a_switch():
+    """A Grbl on a port, whose axis X stands on the switch at the lower end of its travel."""
+    axes = {"X": replace(QUICK, microstep_um=0.5, start_um=0.0), "Y": QUICK}
+    device = GrblController(SYSTEM_CLOCK, axes, settings=QUICK_HOMING)
+    with PtyServer(device) as server:
+        yield device, f"grbl:{server.port}"
+
+
+def advised(text):
+    """Return what to type after `emmc-rig devices`, of each command in a text."""
+    return [words.split() for words in re.findall(r"`emmc-rig devices ([^`]*)`", text)]
+
+
+def test_every_advice_from_a_limit_switch_leads_off_it(run, on_a_switch):
+    device, stage = on_a_switch
+    code, _, err = run("home", "--stage", stage)
+    assert (code, advised(err)) == (1, [["free", "x", "--stage", stage]])
+    code, _, err = run(*advised(err)[0], "--yes")
+    assert (code, "does not report at which end" in one_line(err)) == (1, True)
+    upwards, downwards = advised(err)
+    assert upwards == ["free", "x", "--direction", "up", "--stage", stage]
+    assert downwards[2:4] == ["--direction", "down"]
+    assert device.position_um("X") == pytest.approx(0.0, abs=QUICK.backlash_um)
+    out = done(run(*upwards, "--yes"))
+    assert "+0.5 mm" in out
+    assert device.position_um("X") == pytest.approx(500.0, abs=QUICK.backlash_um + 1)
+    done(run(*advised(out)[0]))
+
+
+def test_a_person_is_asked_for_the_direction_and_before_each_step(run, on_a_switch, monkeypatch):
+    device, stage = on_a_switch
+    for said, code in (("up\nn\n", 1), ("sideways\nup\ny\n", 0)):
+        monkeypatch.setattr(sys, "stdin", io.StringIO(said))
+        assert device.position_um("X") == pytest.approx(0.0, abs=QUICK.backlash_um)
+        assert run("free", "x", "--stage", stage)[0] == code
+    assert device.position_um("X") == pytest.approx(500.0, abs=QUICK.backlash_um + 1)
+
+
+def test_a_jog_sees_the_pressed_switch_before_it_advises_homing(run, on_a_switch):
+    stage = on_a_switch[1]
+    code, _, err = run("jog", "x", -1000, "--stage", stage)
+    assert (code, f"`emmc-rig devices free x --stage {stage}`" in one_line(err)) == (1, True)
+
+
+def test_no_axis_is_moved_off_a_switch_that_is_not_pressed(run):
+    out = done(run("free", "x", "--rig", "simulated:grbl"))
+    assert "no pressed limit switch of x" in out
+    code, _, err = run("free", "z", "--rig", "simulated:grbl")
+    assert (code, "no axis 'z'" in one_line(err)) == (1, True)
+
+
+def test_the_stages_of_a_rigs_file_are_those_of_its_captures(run, tmp_path):
+    (tmp_path / "rig.yaml").write_text("stage: [simulated:grbl, simulated:apt]\ncamera: a\n")
+    code, _, err = run("info", "--stage", "rig.yaml")
+    assert (code, "two stages have an axis x" in one_line(err)) == (1, True)
+    (tmp_path / "rig.yaml").write_text("stage: simulated:grbl\ncamera: simulated\n")
+    assert "unknown" in done(run("info", "--stage", "rig.yaml"))
 
 
 @pytest.mark.slow

@@ -91,7 +91,7 @@ ONE_LINE = {
     "demo --camera rgbw-bayer-3shot": "rgbw-bayer-3shots",
     "demo --camera learned-aperture --shots 9": "more_shots_step_um",
     **{
-        f"reconstruct frames --settings settings-{number}.yaml": f"tv.{name.strip()}"
+        f"reconstruct taken --settings settings-{number}.yaml": f"tv.{name.strip()}"
         for number, name in enumerate(SETTINGS)
     },
     "export taken": "holds frames, no light field yet; run `emmc-rig reconstruct taken`",

@@ -68,11 +68,16 @@ def test_every_kind_of_message_is_read(line, message):
         ),
         (
             b"<Hold:1|MPos:0.000,0.000,0.000|F:500|Pn:PZ|Ov:100,100,100|A:SFM>\r\n",
-            Status("Hold", 1, (0.0, 0.0, 0.0), None, None),
+            Status("Hold", 1, (0.0, 0.0, 0.0), None, None, pressed=("Z",)),
         ),
         (
             b"<Door:3|MPos:1.000,2.000,3.000,4.000|Ln:99999>\r\n",
             Status("Door", 3, (1.0, 2.0, 3.0, 4.0), None, None),
+        ),
+        # Some firmware reports a fourth axis, and an offset of three
+        (
+            b"<Idle|MPos:1.000,2.000,3.000,0.000|WCO:-5.000,-2.000,0.000>\r\n",
+            Status("Idle", None, (1.0, 2.0, 3.0, 0.0), None, (-5.0, -2.0, 0.0)),
         ),
     ],
 )
@@ -106,7 +111,7 @@ def test_work_position_is_machine_position_less_the_offset():
         (b"<Idle|MPos:0.000,,0.000>\r\n", "not a number"),
         (b"<Idle|MPos:0.0.0,1.000>\r\n", "not a number"),
         (b"<Idle|MPos:nan,0.000>\r\n", "not a number"),
-        (b"<Idle|MPos:1.000,0.000|WCO:0.000>\r\n", "different length"),
+        (b"<Idle|WPos:1.000,0.000|WCO:0.000>\r\n", "different length"),
     ],
 )
 def test_bytes_that_are_no_message_are_an_error_in_one_line(line, reason):

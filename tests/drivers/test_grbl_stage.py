@@ -1,6 +1,7 @@
 """What is Grbl's own: alarms, resets, modes, work offsets, and homing that says nothing."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from itertools import count
 
@@ -17,11 +18,13 @@ from emmc_rig.drivers.errors import (
     LimitSwitchError,
     LostPositionError,
     NotHomedError,
+    PositionMismatchError,
+    PressedSwitchError,
     SpeedLimitError,
     TransportTimeoutError,
 )
 from emmc_rig.drivers.grbl import GrblStage, identify
-from emmc_rig.drivers.stage import DEFAULT_SETTINGS, Reading, StageSettings
+from emmc_rig.drivers.stage import DEFAULT_SETTINGS, Direction, Reading, StageSettings
 from emmc_rig.simulators.clock import ManualClock
 from emmc_rig.simulators.grbl import BENCH_AXES, WITH_SINGLE_AXIS_HOMING, GrblController
 
@@ -155,7 +158,7 @@ def test_a_soft_limit_alarm_keeps_the_position_but_asks_for_homing(bench):
     stage.move_by_um({"x": -100.0})
 
 
-def test_a_limit_switch_stops_all_loses_the_position_and_homing_resets_it(bench):
+def test_a_limit_switch_stops_all_loses_the_position_and_is_left_before_homing(bench):
     stage = bench.homed()
     bench.say(b"$20=0\n")
     bench.say(b"G53G0X5\n")
@@ -165,8 +168,78 @@ def test_a_limit_switch_stops_all_loses_the_position_and_homing_resets_it(bench)
     assert caught.value.reply == "ALARM:1"
     with pytest.raises(NotHomedError, match="hard limit reached"):
         stage.move_to_um({"y": -3000.0})
+    # Another program's move ended there: this one knows no direction that leads off the switch.
+    with pytest.raises(PressedSwitchError, match="away from the end of the travel") as refused:
+        stage.home()
+    assert (refused.value.axis, refused.value.away) == ("x", "")
+    assert stage.pressed_switches() == {"x": None}
+    assert stage.move_off_switch("x", Direction.DOWN, 500.0)
     stage.home()
     assert stage.move_to_um({"x": -3000.0})["x"] == pytest.approx(-3000.0, abs=1.0)
+
+
+@pytest.fixture
+def at_the_lower_end():
+    """A bench whose `$130` allows more travel than there is, and a stage that ran into its end."""
+    bench = Bench(settings={codec.TRAVEL: TRAVEL_UM / 1e3 + 10})
+    stage = bench.homed()
+    with pytest.raises(PressedSwitchError) as hit:
+        stage.move_to_um({"x": -TRAVEL_UM - 5000.0})
+    assert (hit.value.axis, hit.value.away, hit.value.reply) == ("x", "up", "ALARM:1")
+    return bench, stage
+
+
+def test_a_move_that_ends_on_a_switch_says_which_way_leads_off_it(at_the_lower_end):
+    bench, stage = at_the_lower_end
+    with pytest.raises(PressedSwitchError, match="off the switch, upwards, before it is homed"):
+        stage.home()
+    assert bench.device.position_um("X") == pytest.approx(0.0, abs=BENCH_AXES["X"].backlash_um)
+    assert stage.pressed_switches() == {"x": Direction.UP}
+    # Outside the travel that `$130` states: Grbl's soft limits would refuse the jog.
+    bench.device.settings[codec.TRAVEL] = 5.0
+    assert stage.move_off_switch("x", Direction.UP, 500.0)
+    assert bench.device.settings[codec.SOFT_LIMITS] == 1
+    assert bench.device.position_um("X") == pytest.approx(500.0, abs=4.0)
+    with pytest.raises(NotHomedError):
+        stage.position_um("y")
+    stage.home()
+    assert stage.pressed_switches() == {}
+
+
+def test_a_step_off_the_switch_that_goes_nowhere_is_an_error(at_the_lower_end):
+    bench, stage = at_the_lower_end
+    with pytest.raises(PositionMismatchError):
+        stage.move_off_switch("x", Direction.DOWN, 500.0)
+    assert bench.device.settings[codec.SOFT_LIMITS] == 1
+
+
+def test_ctrl_c_in_a_step_off_the_switch_stops_it_and_restores_the_soft_limits(
+    at_the_lower_end, monkeypatch
+):
+    bench, stage = at_the_lower_end
+
+    def ctrl_c():
+        raise KeyboardInterrupt
+
+    after_first_sleep(monkeypatch, bench.clock, 0.1, ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        stage.move_off_switch("x", Direction.UP, 5000.0)
+    assert bench.device.settings[codec.SOFT_LIMITS] == 1
+    stands_um = bench.device.position_um("X")
+    bench.clock.sleep(10.0)
+    assert bench.device.position_um("X") == stands_um < 1000.0
+
+
+def test_a_pressed_switch_keeps_the_axes_from_homing_that_would_move_it_and_no_others():
+    axes = BENCH_AXES | {"Z": replace(BENCH_AXES["Z"], start_um=0.0)}
+    stage = Bench(axes=axes).stage()
+    with pytest.raises(PressedSwitchError) as refused:
+        stage.home()
+    # The stage names X and Y alone; Grbl as it is shipped homes Z as well.
+    assert refused.value.axis == "Z"
+    assert stage.move_off_switch("Z", Direction.UP, 500.0)
+    stage.home()
+    Bench(axes=axes, options=WITH_SINGLE_AXIS_HOMING).stage({"x": "X", "focus": "Z"}).home(["x"])
 
 
 def test_a_reset_while_it_moves_is_a_lost_position(bench, monkeypatch):
@@ -328,7 +401,9 @@ def test_a_controller_that_boots_slowly_is_waited_for_and_a_silent_one_is_reset_
     stuck.say(b"G53G0X5\n")
     stuck.clock.sleep(3.0)
     assert stuck.say(b"?") == "ALARM:1\r\n[MSG:Reset to continue]\r\n"
-    stuck.stage().home()
+    waiting = stuck.stage()
+    assert waiting.move_off_switch("x", Direction.DOWN, 500.0)
+    waiting.home()
     dead = Bench()
     dead.device.faults.inject("drop_command", times=math.inf)
     with pytest.raises(TransportTimeoutError, match="check power"):

@@ -77,6 +77,21 @@ def camera():
         yield opened
 
 
+def test_a_camera_without_genicams_properties_has_no_trigger_and_others_keep_theirs():
+    with closing(demo_camera()) as camera:
+        for act in (
+            lambda: camera.set_trigger("Line1", "rising", 1.0),
+            lambda: camera.set_exposure_output("Line2"),
+        ):
+            with pytest.raises(CameraSettingError, match="does not exist"):
+                act()
+        assert camera.choices("NoSuchProperty") == ()
+        assert "16bit" in camera.choices("PixelType")
+        camera.choose("PixelType", "16bit")
+        camera._loaded.reopen()
+        assert camera.details()["PixelType"] == "16bit"
+
+
 @pytest.mark.slow
 def test_the_suite_finds_that_the_demo_stage_only_says_that_it_was_homed(tmp_path):
     file = tmp_path / "stage.yaml"

@@ -1,6 +1,7 @@
 """A PTP camera over simulated USB: right frames, and for every fault one clear line or a cure."""
 
 import math
+from datetime import timedelta
 
 import numpy as np
 import pytest
@@ -21,9 +22,10 @@ from emmc_rig.drivers.errors import (
 from emmc_rig.drivers.ptp import PtpCamera, PtpSession, PtpSettings, is_raw
 from emmc_rig.drivers.ptp_codec import Format, ObjectInfo, Operation
 from emmc_rig.drivers.ptp_usb import PTP_INTERFACE, PtpUsb
+from emmc_rig.drivers.raw import captured_at
 from emmc_rig.drivers.usb import open_device
 from emmc_rig.simulators.clock import ManualClock
-from emmc_rig.simulators.ptp import ANY_EXPOSURE, PtpCameraSimulator, PtpUsbFunction
+from emmc_rig.simulators.ptp import ANY_EXPOSURE, EPOCH, PtpCameraSimulator, PtpUsbFunction
 from emmc_rig.simulators.usb import SimulatedUsb
 
 SHAPE = (60, 80)
@@ -149,6 +151,17 @@ def test_gain_is_iso_over_the_lowest_and_acts_above_the_black_level(bench):
     frame = camera.snap()
     assert frame.gain == 4.0
     assert (frame.mosaic == 64 + 4 * 100).all()
+
+
+def test_a_file_states_the_time_by_the_cameras_clock_its_serial_number_and_iso(bench):
+    camera = bench.open()
+    camera.set_gain(4.0)
+    metadata = camera.snap().metadata
+    assert (metadata["serial"], metadata["iso"]) == (camera.identity.serial, "400")
+    captured = captured_at(metadata)
+    assert captured is not None
+    now = EPOCH + timedelta(seconds=bench.clock.now_s())
+    assert timedelta(0) <= now - captured < timedelta(seconds=1)
 
 
 def test_the_camera_reports_its_time_and_battery(bench):

@@ -31,6 +31,7 @@ from emmc_rig.drivers.errors import (
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene
+from emmc_rig.live import server
 from emmc_rig.live import watch as watch_module
 from emmc_rig.live.driving import Driving
 from emmc_rig.live.picture import CLIPPED_BGR, SATURATED_BGR, View, encoded, picture, window
@@ -631,7 +632,10 @@ def test_strangers_are_refused():
     ("order", "body", "why"),
     [
         ("exposure", "not json", "not JSON"),
+        ("exposure", "[" * 100_000, "not JSON"),
+        ("exposure", f'{{"seconds": 1{"0" * 5000}}}', "not JSON"),
         ("exposure", "[1]", "send a JSON object"),
+        ("exposure", "null", "send a JSON object"),
         ("exposure", "{}", "exposure: seconds: field required"),
         ("exposure", '{"seconds": "1"}', "exposure: seconds: input should be a number"),
         ("exposure", '{"seconds": NaN}', "exposure: seconds: input should be a finite number"),
@@ -642,6 +646,7 @@ def test_strangers_are_refused():
         ("jog", '{"axis": "mask_x", "distance_um": 1}', "no stage here"),
         ("centre", "{}", "it is not known where the masks are centred"),
         ("home", '{"axis": "mask_x"}', "home: this order takes no arguments"),
+        ("home", '{"\\ud800": "self"}', "home: this order takes no arguments"),
         ("look", '{"target": "moon"}', "cannot look at 'moon' here"),
         ("reference", '{"taken": 1}', "reference: taken: input should be true or false"),
         ("preview", '{"what": "mask"}', "preview: what: input should be a list"),
@@ -651,11 +656,16 @@ def test_an_order_that_makes_no_sense_is_refused_in_one_clear_line(refusing, ord
     status, _, reported = refusing("POST", f"/{TOKEN}/do/{order}", body)
     assert (status, reported.decode().count("\n")) == (400, 1)
     assert why in reported.decode()
+    assert "<" not in reported.decode()
 
 
 def test_unknown_orders_long_bodies_and_impossible_pictures_are_refused(refusing):
     assert refusing("POST", f"/{TOKEN}/do/explode", "{}")[0] == 404
-    assert refusing("POST", f"/{TOKEN}/do/exposure", " " * 200_000)[0] == 413
+    assert refusing("POST", f"/{TOKEN}/state", "{}")[0] == 405
+    assert refusing("POST", f"/{TOKEN}/do/exposure", " " * 5_000_000)[::2] == (
+        413,
+        b"more than 131072 bytes\n",
+    )
     for query in ("part=x", "part=nan", "kind=xray"):
         assert refusing("GET", f"/{TOKEN}/picture.jpg?{query}")[0] == 400
 
@@ -717,6 +727,25 @@ def test_only_the_page_itself_by_scheme_host_and_port_may_act(refusing, origin, 
     given = {"Origin": origin.format(port=refusing.port)}
     body = json.dumps({"seconds": 0.01})
     assert refusing("POST", f"/{TOKEN}/do/exposure", body, given)[0] == status
+
+
+def test_a_request_that_is_late_or_damaged_is_ended_without_a_line_in_the_log(capfd, monkeypatch):
+    monkeypatch.setattr(server, "REQUEST_S", 0.2)
+    post = b"POST /secret/do/exposure HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+    with fake_page() as (_, ask):
+        for begun, answer in (
+            (b"GET ", b""),
+            (b"GET /secret/", b""),
+            (post, b""),
+            (post + b"Content-Type: application/json\r\nContent-Length: 9\r\n\r\n{", b""),
+            (post + b"Content-Length: x\r\n\r\n{", b"HTTP/1.1 400 "),
+            (b"nonsense\r\n\r\n", b"HTTP/1.1 400 "),
+        ):
+            with socket.create_connection(("127.0.0.1", ask.port), PATIENCE_S) as link:
+                link.sendall(begun)
+                assert link.makefile("rb").read().startswith(answer)
+        assert ask("GET", f"/{TOKEN}/state")[0] == 200
+    assert capfd.readouterr().err == ""
 
 
 def test_who_goes_in_the_middle_of_a_request_leaves_no_traceback(capfd):

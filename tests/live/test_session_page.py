@@ -3,10 +3,14 @@
 import http.client
 import json
 import re
+import socket
 import subprocess
+import sys
 import threading
 import time
 import urllib.request
+from contextlib import ExitStack, suppress
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -14,7 +18,7 @@ import pytest
 import yaml
 from asked_person import manned
 from pages import order
-from programs import PROGRAM
+from programs import PROGRAM, wait_until
 
 import emmc_rig as emmc
 from emmc_rig.captures.control import Control
@@ -33,6 +37,14 @@ PLAN = {
     "whiteboards": {"views": [[2, 2]], "repeats": 1, "references": 2},
     "darks": {"repeats": 2},
 }
+
+
+def answer(url, values=None):
+    """Return the answer to GET, or to a POST of values."""
+    body = None if values is None else json.dumps(values).encode()
+    request = urllib.request.Request(url, body, {"Content-Type": "application/json"})
+    with urllib.request.urlopen(request, timeout=60) as answered:
+        return json.load(answered)
 
 
 def nobody(what):
@@ -195,6 +207,26 @@ def test_the_first_state_is_not_pushed_again_and_again(tmp_path):
     assert len(states) <= 3
 
 
+@pytest.mark.slow
+def test_who_never_reads_what_is_pushed_holds_nobody_up(tmp_path, capfd):
+    page = SessionPage(tmp_path / "session", Control(), computes=False)
+    page.start()
+    with ExitStack() as links, served(application(page, "a-secret")) as port:
+        for _ in range(3):
+            link = links.enter_context(socket.create_connection(("127.0.0.1", port), 60))
+            link.sendall(b"GET /a-secret/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        for number in range(30):  # more than the sockets hold
+            page.state.publish(why=f"{number}" * 1_000_000)
+            began_s = time.monotonic()
+            assert answer(f"http://127.0.0.1:{port}/a-secret/state")["why"][0] == f"{number}"[0]
+            assert time.monotonic() - began_s < 5
+            time.sleep(0.05)
+        page.close()
+        began_s = time.monotonic()
+    assert time.monotonic() - began_s < 5
+    assert capfd.readouterr().err == ""
+
+
 class Answering(SessionPage):
     """A page whose every wish is answered; stop_at: number of the wish at which it is stopped."""
 
@@ -277,29 +309,68 @@ def test_a_page_that_steers_answers_for_a_capture_without_a_terminal(tmp_path):
     )  # fmt: skip
     with running:
         assert running.stderr is not None
-        address = next(found.group() for line in running.stderr
-                       if (found := re.search(r"http://localhost:\d+/\S+/", line)))  # fmt: skip
+        _, address = read_until(running.stderr, r"http://localhost:\d+/\S+/")
 
         def asked(than=0):
             for _ in range(600):
-                with urllib.request.urlopen(f"{address}state") as answer:
-                    now = json.load(answer)["asked"]
+                now = answer(f"{address}state")["asked"]
                 if now and now["number"] > than:
                     return now
                 time.sleep(0.1)
             raise AssertionError("nothing is asked")
 
-        def act(name, **values):
-            headers = {"Content-Type": "application/json"}
-            body = json.dumps(values).encode()
-            request = urllib.request.Request(f"{address}do/{name}", body, headers)
-            urllib.request.urlopen(request).close()
-
         first = asked()
         assert first["text"] == "switch the lamp off"
-        act("done", number=first["number"])
+        answer(f"{address}do/done", {"number": first["number"]})
         asked(than=first["number"])
-        act("stop")
+        answer(f"{address}do/stop", {})
         line = running.stderr.read()
     assert running.returncode == 130
     assert "stopped at once" in line
+
+
+def answers(address):
+    with suppress(OSError):
+        return answer(f"{address}state")["done"]
+
+
+def read_until(lines, pattern):
+    """Return the lines up to the first that matches, and the match."""
+    read = []
+    for line in lines:
+        read.append(line)
+        if match := re.search(pattern, line):
+            return read, match.group()
+    raise AssertionError("".join(read))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell sets the limit of open files")
+def test_a_flood_of_connections_neither_ends_a_capture_nor_fills_its_log(tmp_path):
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
+    command = [*PROGRAM, "capture", "plan.yaml", "--rig", "simulated", "--steer"]
+    size = ["--size", "24x32", "--scene", "near-planar", "--rays", "16"]
+    few_files = ["sh", "-c", 'ulimit -n 1024; exec "$@"', "sh"]
+    running = subprocess.Popen(
+        [*few_files, *command, *size], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    )
+    with running, ExitStack() as open_things:
+        open_things.callback(running.kill)
+        flood = open_things.enter_context(ExitStack())
+        assert running.stderr is not None
+        _, address = read_until(running.stderr, r"http://\S+/")
+        place = urlsplit(address)
+        for _ in range(1100):
+            link = socket.create_connection((place.hostname, place.port), 60)
+            flood.enter_context(link)
+            with suppress(ConnectionError):  # closed at once where too many are open
+                link.sendall(b"GET ")
+        log, _ = read_until(running.stderr, ALL_TAKEN)
+        flood.close()
+        wait_until(lambda: answers(address), 60)
+        answer(f"{address}do/stop", {})
+        log += running.stderr
+        assert running.wait(60) == 0
+    # Without a flood it prints four.
+    assert len(log) <= 10 + 4, log
+    assert Session(tmp_path / "plan-session").is_complete

@@ -59,7 +59,7 @@ def test_every_level_of_a_verdict_is_a_sentence_of_a_head():
         ),
         (
             {"stated_db": 31.24, "stated_worst_db": 24.13, "stated_worst_at": [40, 66]},
-            "; estimated accuracy 31.2 dB; least, 24.1 dB, about row 40, column 66",
+            "; estimated accuracy 31.2 dB; least accurate about row 40, column 66: 24 dB",
         ),
         (
             {"stated_db": 31.24, "stated_worst_db": 29.0, "stated_worst_at": [40, 66]},

@@ -1,12 +1,15 @@
 """Frames that leave a session as DNG files: exiftool reads the facts, LibRaw the mosaic."""
 
+import io
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from datetime import datetime
 
 import numpy as np
 import pytest
+import tifffile
 from capture_rigs import begun, still_rig
 
 from emmc_rig.captures.sequencer import Sequencer
@@ -15,7 +18,7 @@ from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.model.files import SYSTEM_DISK
 from emmc_rig.session.export import export_dng
-from emmc_rig.session.frame_file import decode_frame
+from emmc_rig.session.frame_file import decode_frame, frame_file
 from emmc_rig.session.session import Session
 
 needs_exiftool = pytest.mark.skipif(shutil.which("exiftool") is None, reason="no exiftool")
@@ -58,13 +61,13 @@ def test_every_frame_is_a_dng_of_the_same_mosaic_and_levels(session, tmp_path):
 
 
 @needs_exiftool
-def test_exiftool_reads_exposure_iso_time_serial_and_session(session, tmp_path):
+def test_exiftool_reads_exposure_time_serial_and_session(session, tmp_path):
     files = exported(session, tmp_path / "out")
     ids = set()
     for name, path in files.items():
         entry, facts = session.stored[name], told(path)
         assert facts["ExifIFD:ExposureTime"] == pytest.approx(entry.exposure_s, rel=1e-5)
-        assert facts["ExifIFD:ISO"] == round(100 * entry.gain)
+        assert "ExifIFD:ISO" not in facts  # the camera states a gain, but no ISO
         at = datetime.fromisoformat(entry.wall)
         assert facts["ExifIFD:DateTimeOriginal"] == at.strftime("%Y:%m:%d %H:%M:%S")
         assert int(facts["ExifIFD:SubSecTimeOriginal"]) == at.microsecond // 1000
@@ -100,6 +103,28 @@ def test_what_is_not_known_is_not_stated(tmp_path):
     for name in ("ExposureTime", "ISO", "DateTimeOriginal", "SerialNumber", "ImageUniqueID"):
         assert f"ExifIFD:{name}" not in stated
     assert stated["ExifIFD:ExifVersion"] in ("0232", 232)
+
+
+def test_a_dng_in_a_session_states_time_serial_and_iso():
+    mosaic = np.full((32, 40), 500, np.uint16)
+    metadata = {"maker": "EMMC", "model": "plug-in", "iso": "400"}
+    of_plugin = replace(
+        decode_raw(encode_dng(mosaic, "rggb", 64, 1023, 0.01)),
+        original=b"a plug-in's bytes",
+        metadata=metadata,
+    )
+    data = frame_file(of_plugin, "2026-11-25T23:59:01.207+01:00", "S7").data
+    with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        tags = tiff.pages.first.tags
+        exif = tags.valueof(34665)
+        assert tags.valueof(306) == exif["DateTimeOriginal"] == "2026:11:25 23:59:01"
+        assert tags.valueof(50735) == exif["BodySerialNumber"] == "S7"
+    assert exif["SubsecTime"] == exif["SubsecTimeOriginal"] == "207"
+    assert exif["OffsetTime"] == exif["OffsetTimeOriginal"] == "+01:00"
+    assert (exif["ISOSpeedRatings"], exif["ExposureTime"]) == (400, (1, 100))
+    unknown = replace(of_plugin, metadata={})
+    with tifffile.TiffFile(io.BytesIO(frame_file(unknown).data)) as tiff:
+        assert set(tiff.pages.first.tags.valueof(34665)) == {"ExifVersion", "ExposureTime"}
 
 
 def test_frames_are_not_written_where_something_else_lies(session, tmp_path):
