@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -410,12 +411,35 @@ class MicroManagerCamera:
         return self._frame(image, metadata)
 
     def _frame(self, image: np.ndarray, metadata: Mapping[str, str]) -> RawFrame:
+        """Return an image of the core as a frame, at the times that its metadata state."""
+        arrived_s = self._clock.now_s()
         mosaic = np.asarray(image, dtype=np.uint16)
         if mosaic.shape != self.shape:
             raise CaptureError(f"it has {mosaic.shape} pixels instead of {self.shape}")
         levels_dn = self._setup.black_level_dn, self.white_level_dn
-        about = self.exposure_s, self.identity, self._clock.now_s(), metadata
-        return frame_of_array(mosaic, self.cfa, *levels_dn, *about)
+        about = self.exposure_s, self.identity, arrived_s, metadata
+        times = _captured(metadata), _elapsed_s(metadata)
+        return frame_of_array(mosaic, self.cfa, *levels_dn, *about, *times)
+
+
+def _elapsed_s(metadata: Mapping[str, str]) -> float | None:
+    """Return when the adapter had an image, s from the beginning of its sequence.
+
+    The core states it for adapters that do not, when the image reached it (MMCore, CircularBuffer).
+    """
+    try:
+        elapsed_s = float(metadata["ElapsedTime-ms"]) / 1e3
+    except (KeyError, ValueError):
+        return None
+    return elapsed_s if math.isfinite(elapsed_s) else None
+
+
+def _captured(metadata: Mapping[str, str]) -> datetime | None:
+    """Return the time of day when the core received an image."""
+    try:
+        return datetime.fromisoformat(metadata["TimeReceivedByCore"]).astimezone()
+    except (KeyError, ValueError):
+        return None
 
 
 def _shifted(cfa: str, top: int, left: int) -> str:

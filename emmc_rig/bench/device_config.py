@@ -211,7 +211,7 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
 
 
 def stages_of_rig(spec: str) -> list[Any] | None:
-    """Return the stages that a rig's YAML file names; None where `spec` is no such file."""
+    """Return the stages that a rig's YAML file names, or None where `spec` names no rig."""
     if not spec.endswith((".yaml", ".yml")):
         return None
     read = read_yaml(Path(spec), AppError)

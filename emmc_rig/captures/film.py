@@ -2,7 +2,8 @@
 
 A place in time is a whole number of periods of the film's rate after a segment's first frame. A
 frame that comes late, or for which memory has no room, is dropped: it cannot be taken again. The
-camera never waits.
+camera never waits. The time of a frame is by the camera's clock if it states one, else by the
+clock of this computer when the frame arrived.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from functools import partial
 from itertools import groupby, pairwise, takewhile
 from queue import Empty, Full, Queue
 from threading import Event
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.captures.control import Control
@@ -30,7 +31,7 @@ from emmc_rig.drivers.errors import CaptureError
 from emmc_rig.drivers.raw import RawFrame
 from emmc_rig.errors import AppError
 from emmc_rig.session.brightness import figures
-from emmc_rig.session.journal import DroppedEntry, FilmEntry, of_kind
+from emmc_rig.session.journal import DroppedEntry, FilmEntry, LateEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
 from emmc_rig.session.session import Session
 
@@ -48,6 +49,9 @@ SKIPPED = "the camera skipped the pulse: its frame numbers have a gap"
 LATE = "the bench was not ready at that time"
 SENT_TWICE = "identical to the frame before it"
 INTERRUPTED = "the film was interrupted"
+HOST_CLOCK = "film: times by the host clock, for the camera states none: some ms to a period late"
+LATE_SHARE = 0.5
+"""Of a period: a frame that arrives later than this would have another time by the host clock."""
 
 
 def streams(plan: Plan, camera: CameraDevice) -> bool:
@@ -87,11 +91,19 @@ def refuse_impossible_film(plan: Plan, rig: Rig, frames: Sequence[PlannedFrame])
 
 
 class Arrived(NamedTuple):
-    """A frame of a film at its place in time; film_s: seconds from the segment's first."""
+    """A frame of a film at its place in time."""
 
     place: int
     film_s: float
+    """Seconds from the segment's first frame."""
     frame: RawFrame
+    late_s: float = 0.0
+    """Delay of its arrival by the host clock, s, beyond the smallest delay in the segment."""
+
+    @property
+    def clock(self) -> Literal["camera", "host"]:
+        """Whose clock `film_s` is by."""
+        return "host" if self.frame.camera_time_s is None else "camera"
 
 
 class Ring:
@@ -157,12 +169,14 @@ class Ring:
         """Yield what the camera sends until the film's time is over, at the nearest places."""
         camera, last = self._camera, self._places.stop - 1
         paced = hasattr(camera, "stream_at") and not self._triggered
-        place, first_s = self._places.start, None
+        place, first_s, least_delay_s = self._places.start, None, math.inf
         with closing(camera.stream_at(self._rate_hz) if paced else camera.stream()) as stream:
             for frame in stream:
-                # By the camera's own clock, else when it arrived.
-                at_s = frame.host_time_s if frame.camera_time_s is None else frame.camera_time_s
+                host_s = frame.host_time_s
+                at_s = host_s if frame.camera_time_s is None else frame.camera_time_s
                 assert at_s is not None
+                delay_s = 0.0 if host_s is None else host_s - at_s
+                least_delay_s = min(least_delay_s, delay_s)
                 first_s = at_s if first_s is None else first_s
                 passed = (at_s - first_s) * self._rate_hz
                 before, place = place, self._places.start + round(passed)
@@ -171,7 +185,7 @@ class Ring:
                 if place < before:
                     raise CaptureError("its time stamps run backwards", "open the camera again")
                 if place <= last:
-                    yield Arrived(place, at_s - first_s, frame)
+                    yield Arrived(place, at_s - first_s, frame, delay_s - least_delay_s)
                 if self._places.start + passed >= last or self._stopped.is_set():
                     return
 
@@ -249,6 +263,7 @@ class FilmRun:
         devices.set_camera(first, engine.exposure_s(first))
         self._begin_segment(first)
         read_s, beside = -STAGE_READ_INTERVAL_S, dict[str, Any]()
+        late_s: dict[str, float] = {}
         places = range(_place(first), _place(left[-1]) + 1)
         room = room_for(devices.camera, self._rig.clock)
         triggered = self._plan.trigger is not None
@@ -263,7 +278,12 @@ class FilmRun:
                     read_s = now_s()
                     beside = engine.readings_of_stream(left[0])
                 devices.ask()
+                if arrived.late_s > LATE_SHARE / self._rate_hz:
+                    late_s[left[0].id] = arrived.late_s
                 self._take_arrived(left, arrived, beside)
+        if late_s:
+            late = LateEntry(ids=list(late_s), longest_s=round(max(late_s.values()), 6))
+            self._recorder.note(late, str(late))
         if not control.halting:
             self._drop(left, places.stop, ring.why_missing)
 
@@ -276,13 +296,19 @@ class FilmRun:
         planned, frame, found = left[0], arrived.frame, figures(arrived.frame)
         recorder.emit_step("check", planned)
         if arrived.film_s == 0:
+            if arrived.clock == "host":
+                recorder.tell(HOST_CLOCK)
             check(planned, frame, found, engine.before, self._plan.checks)
         if engine.before is not None and is_same(frame.mosaic, engine.before):
             self._drop(left, arrived.place + 1, lambda place: SENT_TWICE)
             return
         left.pop(0)
         recorder.emit_taken(planned, frame, found)
-        when = {"segment": self._segment, "film_s": arrived.film_s}
+        when = {
+            "segment": self._segment,
+            "film_s": arrived.film_s,
+            "film_clock": arrived.clock,
+        }
         engine.hand_over(planned, frame, found, {}, **when, **beside)
         self._finish(planned)
 
@@ -317,7 +343,7 @@ class FilmRun:
             self._began_s = asked_s
         recorded = bool(self._rig.recorded_s)
         film_s = _place(planned) / self._rate_hz if recorded else asked_s - self._began_s
-        return {"segment": self._segment, "film_s": film_s}
+        return {"segment": self._segment, "film_s": film_s, "film_clock": "host"}
 
 
 def _place(frame: PlannedFrame) -> int:

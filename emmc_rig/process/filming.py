@@ -392,8 +392,7 @@ def reconstruct_film_session(
                 pool,
             )
         failed = {int(name): why for name, why in sorted(reasons.items()) if why}
-        times_s = {at.place: at.time_s for at in places}
-        metrics = _metrics(job, session, count, times_s, failed)
+        metrics = _metrics(job, session, count, places, failed)
         whole = shutil.ignore_patterns(f".*{PART}")
         shutil.copytree(kept / FRAMES, new / FRAMES, ignore=whole, copy_function=_linked)
         if psi_path is None:
@@ -452,10 +451,12 @@ def _metrics(
     job: FilmJob,
     session: Session,
     count: int,
-    times_s: Mapping[int, float],
+    places: Sequence[FilmPlace],
     failed: Mapping[int, str],
 ) -> dict[str, Any]:
     """Return the metrics of a film of which all frames are done."""
+    times_s = {at.place: at.time_s for at in places}
+    clocks = {f"{at.entry.film_clock} clock" if at.entry.film_clock else "" for at in places}
     done = [read_metrics(path) for path in job.done()]
     if not done:
         raise AppError(f"{session.folder}: {next(iter(failed.values()), 'no frame')}")
@@ -475,6 +476,7 @@ def _metrics(
             "frames": count,
             "rate": rate,
             "times_s": _all_times(times_s, count, rate),
+            "times_by": " and ".join(sorted(clocks)),
             "missing": sorted(set(range(count)) - {frame["frame"] for frame in done}),
             "failed": {str(place): why for place, why in failed.items()},
             "begun_anew": anew,

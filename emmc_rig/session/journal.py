@@ -191,6 +191,8 @@ class FrameEntry(Entry):
     """Of a film's frame: its segment, see `FilmEntry`."""
     film_s: float | None = None
     """Of a film's frame: when it was exposed, s from the first frame of its segment."""
+    film_clock: Literal["", "camera", "host"] = ""
+    """Clock of `film_s`: the camera's, or this computer's; "" before version 0.4."""
     spans_s: dict[str, tuple[float, float]] = {}
     """Begin and end of each step, s from the begin of the run."""
 
@@ -435,6 +437,21 @@ class DroppedEntry(TimedEntry):
     def __str__(self) -> str:
         shown = ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
         return f"{len(self.ids)} dropped ({self.reason}): {shown}"
+
+
+class LateEntry(TimedEntry):
+    """Frames of a film that reached this computer late; `film_s` is by the camera's clock."""
+
+    kind: Literal["late"] = "late"
+    ids: list[str]
+    """Of the frames, in the order of time."""
+    longest_s: float
+    """Largest delay of their arrival, s, beyond the smallest delay in the segment."""
+
+    def __str__(self) -> str:
+        shown = ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
+        delay_ms = 1e3 * self.longest_s
+        return f"{len(self.ids)} arrived up to {delay_ms:.0f} ms late (no error of time): {shown}"
 
 
 class CompleteEntry(TimedEntry):

@@ -1,7 +1,9 @@
 """Films: frames at their places in time, from the camera's stream or with the mask stepped."""
 
+import subprocess
+import sys
 import threading
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -29,7 +31,7 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.progress import Watcher
 from emmc_rig.session.frame_file import decode_frame
-from emmc_rig.session.journal import DroppedEntry, FilmEntry, RetryEntry, of_kind
+from emmc_rig.session.journal import DroppedEntry, FilmEntry, LateEntry, RetryEntry, of_kind
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 from emmc_rig.simulators.clock import ManualClock
@@ -234,6 +236,7 @@ def test_a_stepped_mask_goes_through_the_plans_shots_in_a_cycle():
     np.testing.assert_allclose(stood, cycle[np.arange(7) % 3], atol=1)
     times_s = np.array([line.film_s for line in run.lines])
     np.testing.assert_allclose(times_s, np.arange(7) / 2, atol=0.05)
+    assert {line.film_clock for line in run.lines} == {"host"}
 
 
 def test_frames_for_which_the_stage_comes_too_late_are_dropped_with_their_places():
@@ -255,9 +258,10 @@ def test_frames_for_which_the_stage_comes_too_late_are_dropped_with_their_places
 class Stream(PreparedCamera):
     """A camera whose stream gives prepared frames at times of its own."""
 
-    def __init__(self, times_s, values=None, on_frame=lambda place: None):
+    def __init__(self, times_s, values=None, on_frame=lambda place: None, host_s=None):
         super().__init__(self._no_single_frame)
         self.times_s, self.on_frame, self.closed = times_s, on_frame, False
+        self.host_s = host_s or [None] * len(times_s)
         self.values = values or range(100, 100 + len(times_s))
 
     @staticmethod
@@ -266,12 +270,13 @@ class Stream(PreparedCamera):
 
     def stream(self):
         try:
-            for place, (at_s, value) in enumerate(zip(self.times_s, self.values, strict=True)):
+            sent = zip(self.times_s, self.values, self.host_s, strict=True)
+            for place, (at_s, value, host_s) in enumerate(sent):
                 self.on_frame(place)
                 mosaic = np.full(SIZE, value, np.uint16)
                 mosaic[0, 0] = 200
                 frame = decode_raw(encode_dng(mosaic, "rggb", 64, 4000, 0.01), SIZE)
-                yield replace(frame, camera_time_s=at_s, gain=1.0)
+                yield replace(frame, camera_time_s=at_s, host_time_s=host_s, gain=1.0)
         finally:
             self.closed = True
 
@@ -284,7 +289,7 @@ def test_frames_take_the_place_nearest_in_time_and_those_of_a_faster_camera_are_
     camera = Stream([5.0, 5.04, 5.11, 5.13, 5.19, 5.52, 5.6])
     with Ring(camera, 10.0, range(6), room=100) as ring:
         frames = arrived(ring)
-    assert [(place, round(film_s, 3)) for place, film_s, _ in frames] == [
+    assert [(frame.place, round(frame.film_s, 3)) for frame in frames] == [
         (0, 0.0), (1, 0.11), (2, 0.19), (5, 0.52),
     ]  # fmt: skip
     assert ring.why_missing(3) == films.NONE_CAME
@@ -301,7 +306,7 @@ def test_the_camera_is_never_blocked_by_a_slow_disk_and_what_finds_no_room_is_na
         # Nothing is fetched before the camera has sent its last frame.
         assert all_sent.wait(10)
         frames = arrived(ring)
-    places = [place for place, _, _ in frames]
+    places = [frame.place for frame in frames]
     assert places[:3] == [0, 1, 2]
     assert {ring.why_missing(place) for place in range(3, 6)} == {films.SLOW_DISK}
 
@@ -322,18 +327,47 @@ def test_time_stamps_that_run_backwards_end_the_segment():
     assert camera.closed
 
 
-def test_a_frame_that_the_camera_sends_twice_is_dropped():
-    camera = Stream([place / 10 for place in range(5)], values=[300, 301, 301, 302, 303])
-    rig = replace(still_rig(SIZE), camera=camera)
+def filmed(camera):
+    """Return the session of a film of five frames at 10 Hz by this camera, and its notes."""
+    rig, notes = replace(still_rig(SIZE), camera=camera), Acts(None, None)
     text = FILM.replace("frames: 12", "frames: 5").replace("darks: {repeats: 2}", "darks: null")
     session, plan = begun(ROOT, SimulatedDisk(), rig, text)
-    assert Sequencer(session, plan, rig).run().complete
+    assert Sequencer(session, plan, rig, notes).run().complete
+    return session, notes.messages
+
+
+def test_frames_that_arrive_late_keep_the_cameras_time_and_are_named():
+    times_s, delays_s = [0.0, 0.1, 0.2, 0.3, 0.4], [0.02, 0.01, 0.03, 0.09, 0.02]
+    host_s = [50 + at_s + delay_s for at_s, delay_s in zip(times_s, delays_s, strict=True)]
+    session, messages = filmed(Stream(times_s, host_s=host_s))
+    lines = [session.stored[f"film-{place:06d}"] for place in range(5)]
+    np.testing.assert_allclose([line.film_s for line in lines], times_s, atol=1e-9)
+    assert {line.film_clock for line in lines} == {"camera"}
+    (late,) = of_kind(session.journal.entries, LateEntry)
+    assert (late.ids, late.longest_s) == (["film-000003"], pytest.approx(0.08))
+    assert "1 arrived up to 80 ms late (no error of time): film-000003" in messages
+
+
+def test_times_of_a_camera_without_a_clock_are_the_hosts_and_said_to_be():
+    host_s = [50.0, 50.12, 50.2, 50.31, 50.4]
+    session, messages = filmed(Stream([None] * 5, host_s=host_s))
+    lines = [session.stored[f"film-{place:06d}"] for place in range(5)]
+    np.testing.assert_allclose([line.film_s for line in lines], np.array(host_s) - 50, atol=1e-9)
+    assert {line.film_clock for line in lines} == {"host"}
+    assert messages.count(films.HOST_CLOCK) == 1
+    assert not of_kind(session.journal.entries, LateEntry)
+
+
+def test_a_frame_that_the_camera_sends_twice_is_dropped():
+    session, _ = filmed(
+        Stream([place / 10 for place in range(5)], values=[300, 301, 301, 302, 303])
+    )
     (entry,) = of_kind(session.journal.entries, DroppedEntry)
     assert entry.ids == ["film-000002"]
     assert entry.reason == films.SENT_TWICE
 
 
-def test_micro_managers_stream_becomes_a_film_at_the_plans_rate():
+def test_micro_managers_stream_becomes_a_film_at_the_adapters_times_on_a_busy_computer():
     pytest.importorskip("pymmcore_plus", reason="the extra `micromanager` is not installed")
     pytest.importorskip("mm_test_adapters", reason="the extra `micromanager` is not installed")
     from emmc_rig.drivers.micromanager import CameraSetup, MicroManagerCamera, load_core
@@ -341,7 +375,13 @@ def test_micro_managers_stream_becomes_a_film_at_the_plans_rate():
     text = FILM.replace("rate: 10", "rate: 20").replace("exposure_s: 0.02", "exposure_s: 0.002")
     text = text.replace("darks: {repeats: 2}", "darks: null\nchecks: {smallest_signal: 0}")
     setup = CameraSetup(roi=(0, 0, 64, 64))
-    with closing(MicroManagerCamera(load_core("MMConfig_demo.cfg"), setup)) as camera:
+    with ExitStack() as open_things:
+        for _ in range(2):
+            busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            open_things.enter_context(busy)
+            open_things.callback(busy.kill)
+        camera = MicroManagerCamera(load_core("MMConfig_demo.cfg"), setup)
+        open_things.enter_context(closing(camera))
         rig = replace(
             still_rig((64, 64)),
             camera=camera,
@@ -356,6 +396,11 @@ def test_micro_managers_stream_becomes_a_film_at_the_plans_rate():
         # The camera sends some hundred a second.
         assert entry.film_s is not None
         assert entry.film_s * 20 == pytest.approx(int(name[5:]), abs=0.51)
+    lines = list(session.stored.values())
+    adapter_s = np.array([float(line.metadata["ElapsedTime-ms"]) / 1e3 for line in lines])
+    film_s = np.array([line.film_s for line in lines])
+    np.testing.assert_allclose(film_s, adapter_s - adapter_s[0], atol=0.002)
+    assert {line.film_clock for line in lines} == {"camera"}
 
 
 def test_a_frame_of_a_film_is_not_taken_again():

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from contextlib import closing
+from datetime import datetime, timedelta
 from itertools import islice
 
 import numpy as np
@@ -36,7 +37,7 @@ from emmc_rig.drivers.micromanager import (
     StageSetup,
     load_core,
 )
-from emmc_rig.drivers.raw import decode_raw
+from emmc_rig.drivers.raw import captured_at, decode_raw
 from emmc_rig.errors import AppError
 
 DEMO = "MMConfig_demo.cfg"
@@ -189,6 +190,33 @@ def test_a_stream_stops_when_it_is_closed_and_one_frame_can_be_taken_again():
         camera.snap()
     with pytest.raises(CameraClosedError):
         camera.snap()
+
+
+def elapsed_s(frame):
+    return float(frame.metadata["ElapsedTime-ms"]) / 1e3
+
+
+def test_the_time_of_a_streamed_frame_is_the_adapters_and_a_snapped_one_has_that_of_the_day():
+    began = datetime.now().astimezone()
+    with closing(demo_camera(roi=(0, 0, 64, 64))) as camera:
+        camera.set_exposure_s(0.01)
+        with closing(camera.stream()) as stream:
+            frames = list(islice(stream, 5))
+        frames.append(camera.snap())
+    assert [frame.camera_time_s for frame in frames[:5]] == [elapsed_s(f) for f in frames[:5]]
+    assert frames[5].camera_time_s is None
+    for frame in frames:
+        captured = captured_at(decode_raw(frame.original).metadata)
+        assert captured is not None
+        # A DNG holds milliseconds.
+        assert began - timedelta(milliseconds=1) <= captured <= datetime.now().astimezone()
+
+
+def test_an_image_without_a_usable_time_has_none():
+    with closing(demo_camera(roi=(0, 0, 64, 64))) as camera:
+        for stated in ("", "soon", "nan"):
+            metadata = {"ElapsedTime-ms": stated, "TimeReceivedByCore": stated}
+            assert camera._frame(np.zeros((64, 64)), metadata).camera_time_s is None
 
 
 def test_camera_and_stage_of_one_file_share_a_core_until_both_are_closed():

@@ -187,6 +187,9 @@ class GenTlCamera:
                 # The buffer goes back to the producer: its contents must be copied.
                 mosaic = np.array(component.data, dtype=np.uint16)
                 shape = (int(component.height), int(component.width))
+                camera_time_s = None
+                with suppress(GenericException):  # raised where a producer states no time
+                    camera_time_s = buffer.timestamp_ns / 1e9
         except TimeoutException as error:
             raise CaptureError("no frame came from the camera") from error
         if shape != self.shape or mosaic.size != shape[0] * shape[1]:
@@ -200,4 +203,5 @@ class GenTlCamera:
             self.identity,
             self._clock.now_s(),
             {"pixel_format": self._format.name},
+            camera_time_s=camera_time_s,
         )
