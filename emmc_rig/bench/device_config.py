@@ -392,7 +392,7 @@ def settings_of(kind: type[Any]) -> type[Settings]:
 def _names_yaml(spec: str) -> bool:
     """Return whether a device is given by a YAML file; a drive's colon follows no driver's name."""
     return spec.endswith((".yaml", ".yml")) and (
-        ":" not in spec or PureWindowsPath(spec).drive > ""
+        ":" not in spec or bool(PureWindowsPath(spec).drive)
     )
 
 
