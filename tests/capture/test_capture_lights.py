@@ -47,6 +47,11 @@ def lit_rig(lights=True):
     return rig, bench
 
 
+def lamp_of(rig):
+    assert rig.lamp is not None
+    return rig.lamp
+
+
 def captured(rig):
     session, plan = begun(Path("/disk"), SimulatedDisk(), rig, PLAN)
     assert Sequencer(session, plan, rig).run().complete
@@ -75,7 +80,9 @@ def test_frames_are_those_of_a_bench_whose_lamp_a_hand_switches():
 def test_lights_that_do_not_answer_stop_the_capture_and_it_goes_on_afterwards():
     rig, bench = lit_rig()
     session, plan = begun(Path("/disk"), SimulatedDisk(), rig, PLAN)
-    rig.lamp.faults.inject("drop_reply", math.inf, when=lambda occasion: b"red" in occasion.reply)
+    lamp_of(rig).faults.inject(
+        "drop_reply", math.inf, when=lambda occasion: b"red" in occasion.reply
+    )
     with pytest.raises(
         GaveUpError, match=r"the lights \(simulator\) cannot be set to red, .* answ"
     ):
@@ -83,7 +90,7 @@ def test_lights_that_do_not_answer_stop_the_capture_and_it_goes_on_afterwards():
     kept = {name: session.read(name) for name in session.stored}
     assert kept
     assert bench.lamp == "off"
-    rig.lamp.faults.clear()
+    lamp_of(rig).faults.clear()
     assert Sequencer(session, plan, rig).run().complete
     assert {name: session.read(name) for name in kept} == kept
     assert not verify(session).damaged
@@ -95,7 +102,7 @@ def test_one_fault_of_the_lights_costs_no_frame_and_homes_nothing(fault):
     session, plan = begun(Path("/disk"), SimulatedDisk(), rig, PLAN)
     homed, home = [], rig.stage.home
     rig.stage.home = lambda axes=None: homed.append(home(axes))
-    rig.lamp.faults.inject(fault, times=2, skip=3)
+    lamp_of(rig).faults.inject(fault, times=2, skip=3)
     assert Sequencer(session, plan, rig).run().complete
     assert len(homed) == 1
     faults = [entry.fault for entry in of_kind(session.journal.entries, RetryEntry)]
@@ -105,13 +112,13 @@ def test_one_fault_of_the_lights_costs_no_frame_and_homes_nothing(fault):
 def test_an_unplugged_lamp_that_is_plugged_in_again_goes_on_by_itself():
     rig, _ = lit_rig()
     session, plan = begun(Path("/disk"), SimulatedDisk(), rig, PLAN)
-    rig.lamp.faults.inject("unplug", skip=2)
+    lamp_of(rig).faults.inject("unplug", skip=2)
     sleep = rig.clock.sleep
 
     def somebody_plugs_in(duration_s):
         sleep(duration_s)
-        if rig.lamp.unplugged:
-            rig.lamp.replug(power_lost=True)
+        if lamp_of(rig).unplugged:
+            lamp_of(rig).replug(power_lost=True)
 
     rig.clock.sleep = somebody_plugs_in
     assert Sequencer(session, plan, rig).run().complete
@@ -125,6 +132,7 @@ def test_an_unplugged_lamp_that_is_plugged_in_again_goes_on_by_itself():
 def test_a_colour_that_the_lights_lack_is_refused_before_anything_is_lit():
     rig, bench = lit_rig()
     frames = planned_frames(request_for(Path("/disk"), text=PLAN), rig)
+    assert rig.lights is not None
     rig.lights.colours = ("off", "white")
     with pytest.raises(AppError, match=r"have no red, only off, white: name it under lights: in"):
         refuse_impossible(rig, frames)

@@ -16,11 +16,13 @@ from emmc_rig.captures.faults import GaveUpError
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.errors import CameraSettingError
 from emmc_rig.drivers.trigger import begin_by_line, show_exposure
+from emmc_rig.drivers.u3v import U3vCamera
 from emmc_rig.errors import AppError
 from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.session.journal import DroppedEntry, RetryEntry, of_kind
 from emmc_rig.session.session import Session
 from emmc_rig.simulators.lamp import PULSE_S, STROBE_S
+from emmc_rig.simulators.u3v import U3vCameraSimulator
 
 SIZE = (24, 32)
 SHOTS = """
@@ -55,11 +57,21 @@ def run_of(text, before=lambda rig: None):
     return rig, Session(session.folder, disk), lambda s: Sequencer(s, plan, rig).run()
 
 
+def lamp_of(rig):
+    assert rig.lamp is not None
+    return rig.lamp
+
+
+def features_of(camera):
+    assert isinstance(camera, U3vCamera)
+    return camera.features
+
+
 @pytest.mark.parametrize(("edge", "later_s"), [("rising", 0.0), ("falling", PULSE_S)])
 def test_every_frame_begins_with_an_edge_on_its_line(edge, later_s):
     text = SHOTS.replace("Line1,", f"Line1, edge: {edge},")
     rig, session, run = run_of(text)
-    features = rig.camera.features
+    features = features_of(rig.camera)
     assert (features.value("LineMode"), features.value("LineSource")) == (
         "Output", "ExposureActive",
     )  # fmt: skip
@@ -76,17 +88,19 @@ def test_a_camera_that_is_opened_again_keeps_its_trigger():
     rig.still.faults.inject("unplug", skip=60)
     assert run(session).complete
     assert of_kind(session.journal.entries, RetryEntry)
-    reopened = rig.reopen_camera()
-    assert reopened.features.value("TriggerMode") == "On"
-    assert reopened.features.value("TriggerSource") == "Line1"
+    assert rig.reopen_camera is not None
+    features = features_of(rig.reopen_camera())
+    assert features.value("TriggerMode") == "On"
+    assert features.value("TriggerSource") == "Line1"
 
 
 def test_a_lost_pulse_is_waited_out_and_lost_pulses_name_their_frame():
     rig, session, run = run_of(SHOTS)
-    rig.lamp.faults.inject("lost_pulse", times=2)
+    lamp_of(rig).faults.inject("lost_pulse", times=2)
     assert run(session).complete
     assert not of_kind(session.journal.entries, RetryEntry)
     rig, session, run = run_of(SHOTS)
+    assert isinstance(rig.still, U3vCameraSimulator)
     rig.still.lines["Line1"] = lambda after_s, rising: math.inf
     line = r"frame dark-0-r0: gave up .*no pulse came on Line1 within 1 s: check what gives"
     with pytest.raises(GaveUpError, match=line):
@@ -95,7 +109,7 @@ def test_a_lost_pulse_is_waited_out_and_lost_pulses_name_their_frame():
 
 def test_lost_pulses_of_a_film_are_dropped_frames_by_name_and_reason():
     rig, session, run = run_of(FILM)
-    rig.lamp.faults.inject("lost_pulse", times=2, when=lambda at_s: passed(at_s) == 4)
+    lamp_of(rig).faults.inject("lost_pulse", times=2, when=lambda at_s: passed(at_s) == 4)
     rig.still.faults.inject("dropped_frame", when=lambda block: block == 6)
     first: list[float] = []
 

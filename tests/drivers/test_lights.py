@@ -10,7 +10,7 @@ from tcp_server import TcpServer
 from emmc_rig.bench.hardware import open_lights, simulated_lights
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import LightError, PortBusyError, PortNotFoundError
-from emmc_rig.drivers.lights import Exchange, TextLights
+from emmc_rig.drivers.lights import Exchange, MicroManagerLights, TextLights
 from emmc_rig.errors import AppError
 from emmc_rig.simulators import lamp as lamps
 from emmc_rig.simulators.clock import ManualClock
@@ -159,6 +159,7 @@ def test_micromanager_sets_and_reads_back_shutters_and_state_devices():
     config = {"protocol": "mm", "port": "MMConfig_demo.cfg"}
     led = {"device": "LED", "colours": {"off": "Closed", "red": "635nm", "white": 1}}
     with closing(open_lights({**config, **led, "shutter": "LED Shutter"})) as lights:
+        assert isinstance(lights, MicroManagerLights)
         core = lights._loaded.core
         assert lights.set("red") == "635nm, open"
         assert (core.getStateLabel("LED"), core.getShutterOpen("LED Shutter")) == ("635nm", True)
