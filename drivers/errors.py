@@ -369,6 +369,13 @@ class CameraDescriptionError(
     """The camera's own description of its features (GenICam) cannot be used."""
 
 
+class GenicamMissingError(DriverError):
+    """EMVA's library, which follows the descriptions of USB3 Vision cameras, is not installed."""
+
+    def __init__(self) -> None:
+        super().__init__("USB3 Vision cameras need genicam", 'pip install "emmc-rig[u3v]"')
+
+
 class UsbNotFoundError(DriverError):
     """No device that matches is plugged in; `present` names those that are."""
 

@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 
 from emmc_rig.drivers import grbl_codec as codec
@@ -17,6 +17,7 @@ from emmc_rig.drivers.errors import (
     GarbledReplyError,
     LimitSwitchError,
     LostPositionError,
+    MoveTimeoutError,
     PositionMismatchError,
     PressedSwitchError,
     ScaleError,
@@ -44,6 +45,7 @@ BOOT_S = 4.0
 REPORTS_UNTIL_OFFSET = 40
 """Grbl reports the work offset in every 30th report at the latest ("Interface", WCO)."""
 POLL_S = 0.05
+RESETS = 2
 OFF_SWITCH_SPEED_UM_S = 1000.0
 """Of a step off a limit switch: half a millimetre takes half a second, in which a hand is at the
 power switch."""
@@ -74,6 +76,10 @@ FAULTS_BY_ALARM: Mapping[int, type[AxisFaultError]] = {
 ALARMS_UNTIL_RESET = {1, 2}
 """After these Grbl answers nothing but a reset ("Interface", Alarm message)."""
 POSITION_KEPT = 2
+ALARM_ADVICE = {
+    9: "see that nothing is in the way, and that every axis that Grbl homes has a switch: as it is "
+    "shipped Z, too (config.h, HOMING_CYCLE_0); then home the axes",
+}
 
 
 class GrblStage(HostStage):
@@ -171,8 +177,8 @@ class GrblStage(HostStage):
                 try:
                     self._controller.command(line, axis)
                     self._wait_until_idle(limits_s, self._clock.now_s(), self._is_moving)
-                except LimitSwitchError as release:
-                    _log.debug("on the way off the switch: %s", release)
+                except (LimitSwitchError, MoveTimeoutError) as fault:
+                    _log.debug("on the way off the switch, the position decides: %s", fault)
                 pressed = self.pressed_switches()
                 if newly := sorted(pressed.keys() - before.keys()):
                     raise PressedSwitchError(newly[0])
@@ -405,6 +411,8 @@ class _Controller:
                     if isinstance(status, codec.Status):
                         break
                     self._note(status)
+                    if self._waits_for_reset() and isinstance(status, codec.Feedback):
+                        self.raise_alarm()  # it said "Reset to continue", and reports no more
                 else:
                     raise GarbledReplyError(b"", "no report among what came")
         except (TransportTimeoutError, GarbledReplyError) as error:
@@ -502,12 +510,11 @@ class _Controller:
     def leave_alarm(self) -> None:
         """Reset a controller that waits for it, or is held; it stands, so nothing is lost."""
         self.homing_lines.clear()
-        try:
-            state = self.status().state
-        except (TransportTimeoutError, AxisFaultError):
-            state = ""
-        waits = self._alarm is not None and self._alarm.code in ALARMS_UNTIL_RESET
-        if waits or state not in ("Idle", "Alarm"):
+        state = ""
+        if not self._waits_for_reset():
+            with suppress(TransportTimeoutError, AxisFaultError):
+                state = self.status().state
+        if state not in ("Idle", "Alarm"):
             self._reset()
         self._alarm, self._restarted = None, False
 
@@ -532,11 +539,15 @@ class _Controller:
         self.homing_lines.clear()
         alarm = self._alarm
         fault = FAULTS_BY_ALARM.get(alarm.code, AxisFaultError)
-        error = fault(ALL_AXES, f"alarm {alarm.code} ({alarm.meaning})")
+        advice = ALARM_ADVICE.get(alarm.code, "")
+        error = fault(ALL_AXES, f"alarm {alarm.code} ({alarm.meaning})", advice)
         error.loses_position = alarm.code != POSITION_KEPT
         if error.loses_position:
             self._on_lost(alarm.meaning)
         raise error.about(reply=f"ALARM:{alarm.code}")
+
+    def _waits_for_reset(self) -> bool:
+        return self._alarm is not None and self._alarm.code in ALARMS_UNTIL_RESET
 
     def _raise_restart(self) -> None:
         if self._restarted:
@@ -560,9 +571,17 @@ class _Controller:
                     raise
 
     def _reset(self) -> None:
+        """Reset the controller, again without its banner: an alarm drops a reset that comes early.
+
+        Source: protocol.c, `protocol_exec_rt_system`.
+        """
         with self._transport.lock:
-            self._transport.write(codec.SOFT_RESET)
-            self._drain()
+            for _ in range(RESETS):
+                self._restarted = False
+                self._transport.write(codec.SOFT_RESET)
+                self._drain()
+                if self._restarted:
+                    break
         self._alarm, self._restarted = None, False
 
     def _drain(self) -> None:
@@ -603,6 +622,8 @@ class _Controller:
             _log.warning("alarm %d: %s", message.code, message.meaning)
             self._alarm = message
         elif isinstance(message, codec.Banner):
+            if message.version.startswith("0."):
+                raise FirmwareError(f"Grbl {message.version} answers", codec.NEWER_FIRMWARE)
             self._restarted = True
             self._on_lost("the controller restarted")
         elif isinstance(message, codec.Setting):

@@ -22,6 +22,7 @@ JOG_CANCEL = b"\x85"
 STATES = ("Idle", "Run", "Hold", "Jog", "Alarm", "Door", "Check", "Home", "Sleep")
 AXIS_LETTERS = "XYZABC"
 MM_PER_INCH = 25.4
+NEWER_FIRMWARE = "install Grbl 1.1 or grblHAL on it"
 
 SOFT_LIMITS, HARD_LIMITS, HOMING, HOMING_DIRECTIONS = 20, 21, 22, 23
 HOMING_FEED, HOMING_SEEK, HOMING_DEBOUNCE, HOMING_PULL_OFF = 24, 25, 26, 27
@@ -203,9 +204,7 @@ def decode_line(line: bytes) -> Message | None:
 
 def _decode_status(line: bytes, text: str) -> Status:
     if _OLD_STATUS.fullmatch(text):
-        raise FirmwareError(
-            f"a Grbl older than 1.1 answers ({text})", "install Grbl 1.1 or grblHAL on it"
-        )
+        raise FirmwareError(f"a Grbl older than 1.1 answers ({text})", NEWER_FIRMWARE)
     match = _STATUS.fullmatch(text)
     if match is None or match[1] not in STATES:
         raise GarbledReplyError(line, "not a status report")

@@ -46,6 +46,14 @@ INNER_SHARE = 0.5
 """Share of the tolerance to which ADMM solves a working set."""
 DEPENDENT = 1e-3
 """An atom adds nothing if chosen atoms explain all but this share of its norm."""
+SEEN_WEAKLY = 0.7
+"""Ridge of OMP's choice, over the square of the median norm of sensed atoms.
+
+An atom of prior variance s^2 raises the likelihood of a residual r by
+(a_j . r)^2 / (|a_j|^2 + noise^2 / s^2). Without the ridge OMP takes atoms that the masks hardly
+show: middles of group A (64x80) lose 3.2 dB with one shot of a Bayer camera, 1.2 with three. With
+0.5 and 1 they lose 0.2 at most.
+"""
 FRESH = 0.7
 """LARS: when the level has fallen to this share, correlations are computed anew (32-bit sums)."""
 DARKEST = 1e-6
@@ -463,7 +471,7 @@ class _Omp(_Solver):
     """Orthogonal matching pursuit (Pati 1993).
 
     Step:
-        j        = the atom of the largest |a_j . residual| / |a_j|
+        j        = the atom of the largest |a_j . residual| / sqrt(|a_j|^2 + ridge)
         q        = a_j less its projection on the basis, normed; it joins the basis
         residual = residual - (q . residual) q
     Done at `atoms` atoms, or where |residual| is at most the tolerance.
@@ -474,6 +482,8 @@ class _Omp(_Solver):
         norms = self.sensed.norms
         lit = norms > DARKEST * norms.max()
         self.inverse_norms = np.where(lit, 1 / np.where(lit, norms, 1), 0).astype(np.float32)
+        ridge = SEEN_WEAKLY * self.sensed.typical_norm**2
+        self.scale = np.where(lit, 1 / np.sqrt(np.square(norms) + ridge), 0).astype(np.float32)
         self.most_steps = min(self.settings.atoms, self.measured, *self.atoms.shape)
         self.basis = np.empty((self.most_steps, self.data.size))
         self.chosen: list[int] = []
@@ -481,9 +491,9 @@ class _Omp(_Solver):
         self.done = bool(np.linalg.norm(self.residual) <= self.tolerance)
 
     def step(self) -> None:
-        cosine = np.abs(self.atoms @ self.residual.astype(np.float32)) * self.inverse_norms
-        best = int(cosine.argmax())
-        if cosine[best] == 0:
+        gain = np.abs(self.atoms @ self.residual.astype(np.float32)) * self.scale
+        best = int(gain.argmax())
+        if gain[best] == 0:
             self.done = True
             return
         span, new = self.basis[: len(self.chosen)], self.atoms[best].astype(np.float64)
@@ -491,7 +501,7 @@ class _Omp(_Solver):
             new -= (span @ new) @ span
         norm = np.linalg.norm(new)
         independent = norm * self.inverse_norms[best] > DEPENDENT
-        self.inverse_norms[best] = 0
+        self.scale[best] = 0
         if independent:
             self.basis[len(self.chosen)] = new / norm
             self.residual -= (new @ self.residual) / norm**2 * new

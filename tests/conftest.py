@@ -123,6 +123,14 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.write_line(f"{len(ran)} checks ran on real light fields{why}")
         for line in ran:
             terminalreporter.write_line(line)
+    absent = [
+        report
+        for report in terminalreporter.stats.get("skipped", [])
+        if "peers" in getattr(report, "keywords", ())
+    ]
+    if absent:
+        terminalreporter.section("independent programs")
+        terminalreporter.write_line(f"{len(absent)} checks were skipped; -rs says what is absent")
 
 
 @pytest.fixture

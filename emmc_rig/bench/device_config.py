@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Annotated, Any, Literal, Self, get_type_hints
 
 from pydantic import (
@@ -211,7 +211,7 @@ def parse_stage(spec: str, overrides: Mapping[str, Any] | None = None) -> StageC
 
 
 def stages_of_rig(spec: str) -> list[Any] | None:
-    """Return the stages that a rig's YAML file names; None where `spec` is no such file."""
+    """Return the stages that a rig's YAML file names, or None where `spec` names no rig."""
     if not spec.endswith((".yaml", ".yml")):
         return None
     read = read_yaml(Path(spec), AppError)
@@ -389,13 +389,20 @@ def settings_of(kind: type[Any]) -> type[Settings]:
     return create_model(kind.__name__, __base__=Settings, **found)
 
 
+def _names_yaml(spec: str) -> bool:
+    """Return whether a device is given by a YAML file; a drive's colon follows no driver's name."""
+    return spec.endswith((".yaml", ".yml")) and (
+        ":" not in spec or bool(PureWindowsPath(spec).drive)
+    )
+
+
 def parse_camera(spec: str | Mapping[str, Any]) -> CameraChoice:
     """Return the camera that `DRIVER:ADDRESS`, a YAML file's name, or its content describes.
 
     The file holds `driver` (in earlier versions `kind`), `address` and what that driver takes.
     Raises AppError with one line.
     """
-    if isinstance(spec, str) and (not spec.endswith((".yaml", ".yml")) or ":" in spec):
+    if isinstance(spec, str) and not _names_yaml(spec):
         driver, _, address = spec.partition(":")
         return CameraChoice(driver, address, source=f"camera {shown_path(spec)}")
     source = shown_path(spec) if isinstance(spec, str) else "the rig's camera"

@@ -50,8 +50,8 @@ AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (d
 
 OFF_SWITCH_STEP_UM = 500.0
 """A step off a limit switch; a switch's way is a few times as long."""
-MOST_STEPS_OFF_SWITCH = 10
-"""5 mm, further than a switch is pressed: then it is stuck, or the direction is wrong."""
+MOST_STEPS_OFF_SWITCH = 6
+"""3 mm, further than a switch is mostly pressed: it may be stuck, or the direction wrong."""
 
 
 register(app)
@@ -364,7 +364,7 @@ def free(
             give_result(axis=axis, pressed=False, moved_um=0.0)
             return
         named, switched = rig or stage or "", cast("Any", opened)
-        away = direction or pressed[axis] or _asked_direction(axis, named, yes)
+        away = direction or pressed[axis] or _asked_direction(axis, yes)
         for steps in range(1, MOST_STEPS_OFF_SWITCH + 1):
             question = f"Move {axis} {away} by {OFF_SWITCH_STEP_UM / 1e3:g} mm?"
             if not yes and not typer.confirm(question, err=True):
@@ -391,10 +391,10 @@ def pressed_switches(stage: Stage) -> dict[str, Direction | None]:
     return getattr(stage, "pressed_switches", dict)()
 
 
-def _asked_direction(axis: str, named: str, yes: bool) -> Direction:
+def _asked_direction(axis: str, yes: bool) -> Direction:
     """Return the direction that leads off a switch, from a person; raises AppError without one.
 
-    named: the stage, as it was named. yes: nobody is there to be asked.
+    yes: no question may be asked.
     """
     unknown = (
         f"{axis} stands on a limit switch, and the controller does not report at which end of the "
@@ -407,10 +407,9 @@ def _asked_direction(axis: str, named: str, yes: bool) -> Direction:
             return Direction(typer.prompt(question, type=Direction, err=True))
         except typer.Abort:  # no terminal to ask at
             pass
-    ways = " or ".join(f"`{free_command(axis, named, way)}`" for way in Direction)
     raise AppError(
-        f"{unknown}: look where it stands, then move it up from the lower end or down from the "
-        f"upper end, by {ways}"
+        f"{unknown}: look where it stands, and add --direction up at the lower end, or --direction "
+        "down at the upper end"
     )
 
 

@@ -36,8 +36,6 @@ NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
 """By command and option: the option, or options, that it depends on."""
 RENAMED = {"calibrate": {"--route": "--method", "--leave-out": "--skip"}}
 """By command: options of earlier versions, which scripts use, and their new names."""
-NUMBERS = {"jog"}
-"""Commands with numbers for arguments: -5 is a number there, not an option."""
 _NEGATIVE = re.compile(r"-\.?\d")
 SIMULATED_ONLY = ("scene", "size", "seed", "rays", "flaws", "real_time")
 
@@ -49,12 +47,19 @@ class ModalCommand(TyperCommand):
         super().__init__(*args, params=[*(params or ()), _json_option()], **more)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the command line; options of earlier versions are taken under their new names."""
+        """Read the command line; options of earlier versions are taken under their new names.
+
+        A word such as -5 is a number: no option of any command begins with a digit.
+        """
         renamed = RENAMED.get(self.name or "", {})
         words = [_under_new_name(word, renamed) for word in args]
-        if self.name in NUMBERS:  # a number with a space before it looks like no option
-            words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
-        return super().parse_args(ctx, words)
+        # A number with a space before it looks like no option; text is taken without the space.
+        words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
+        left = super().parse_args(ctx, words)
+        for name, value in ctx.params.items():
+            if isinstance(value, str) and _NEGATIVE.match(value.lstrip()):
+                ctx.params[name] = value.lstrip()
+        return left
 
     def invoke(self, ctx: Any) -> Any:
         """Run it; raises BadParameter."""

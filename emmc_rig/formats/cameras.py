@@ -74,7 +74,7 @@ def camera_file(spec: str) -> Path:
     Raises CameraError naming the nearest shipped camera when there is none.
     """
     path = Path(spec)
-    if path.suffix.lower() in (".yaml", ".yml") or os.sep in spec:
+    if path.suffix.lower() in (".yaml", ".yml") or os.sep in spec or "/" in spec:
         return path
     shipped = shipped_camera_files()
     if spec in shipped:

@@ -14,6 +14,7 @@ import asyncio
 import json
 import secrets
 import socket
+import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -225,7 +226,7 @@ def listening_socket(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
         raise AppError(
             f"cannot serve at {host} port {port} ({why}): choose another port or host"
         ) from fault
-    if hasattr(socket, "TCP_USER_TIMEOUT"):  # accepted connections inherit it
+    if sys.platform == "linux":  # accepted connections inherit it
         waited_ms = round(1e3 * READING_S)
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, waited_ms)
     return listening

@@ -35,6 +35,19 @@ def test_every_mode_and_what_it_takes_is_a_parameter_of_its_command():
         assert names.issuperset(set().union(*modes.values()))
 
 
+def test_no_option_of_any_command_begins_with_a_digit_so_that_minus_five_is_a_number(tmp_path):
+    groups = [command for command in COMMANDS.values() if hasattr(command, "commands")]
+    members = [member for group in groups for member in group.commands.values()]
+    for command in [*COMMANDS.values(), *members]:
+        for parameter in command.params:
+            assert not any(name.lstrip("-")[:1].isdigit() for name in parameter.opts)
+    for words in (["x", "-5"], ["--to", "x", "-5000"], ["x", "--", "-5"]):
+        _, _, err = program("devices", "jog", "--rig", "simulated:teapot", *words)
+        assert "teapot" in err
+    code, _, err = program("reconstruct", "-5", "--out", tmp_path / "out")
+    assert (code, " -5: " in err, "'" in err) == (1, True, False)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("command", MODES)
 def test_whatever_a_mode_ignores_is_refused(command, tmp_path, monkeypatch):

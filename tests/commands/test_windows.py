@@ -11,6 +11,8 @@ import scipy.io
 import yaml
 from programs import PROGRAM
 
+from emmc_rig.bench.device_config import parse_camera
+from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import shipped_camera_files
 from emmc_rig.process.reconstructing import open_frames
 from emmc_rig.session.board_sets import decoded
@@ -63,16 +65,16 @@ def test_a_bench_is_captured_imported_and_reconstructed(tmp_path, run):
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(camera))
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
     run("capture", "plan.yaml", *RIG, "--out", "captured")
-    captured = Session(tmp_path / "captured")
+    session = Session(tmp_path / "captured")
     table = ["file,kind,shot,exposure_s"]
-    for frame, raw in zip(captured.frames, decoded(captured, captured.frames), strict=True):
+    for frame, raw in zip(session.frames, decoded(session, session.frames), strict=True):
         shot = "" if frame.kind == "dark" else frame.bench.shot
         table.append(f"{frame.id}.mat,{frame.kind},{shot},{raw.exposure_s!r}")
         scipy.io.savemat(tmp_path / f"{frame.id}.mat", {"frame": raw.mosaic})
     (tmp_path / "table.csv").write_text("\n".join(table))
     run("import", "table.csv", "--camera", "mine.yaml", "--out", "imported")
-    readings = [open_frames(tmp_path / name)[1].readings for name in ("captured", "imported")]
-    assert np.array_equal(*readings)
+    captured, imported = (open_frames(tmp_path / name)[1] for name in ("captured", "imported"))
+    assert np.array_equal(captured.readings, imported.readings)
     run("simulate", "--camera", "mine.yaml", "--size", "32x40", "--out", "simulated")
     (tmp_path / "blocks.yaml").write_text("blocks: {side: 20}")
     for _ in range(2):  # the second result replaces the first
@@ -82,6 +84,11 @@ def test_a_bench_is_captured_imported_and_reconstructed(tmp_path, run):
         )  # fmt: skip
     metrics = json.loads((tmp_path / "result/metrics.json").read_text("utf-8"))
     assert metrics["workers"] == 2, metrics
+
+
+def test_a_path_that_begins_with_a_drive_names_no_driver():
+    with pytest.raises(AppError, match="no such file"):
+        parse_camera(r"C:\bench\camera.yaml")
 
 
 def test_what_needs_a_pseudo_terminal_is_refused_in_a_line(run):

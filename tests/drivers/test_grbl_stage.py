@@ -325,6 +325,12 @@ def test_a_grbl_of_version_0_9_is_named_by_its_report():
         codec.decode_line(b"<Idle,MPos:0.000,0.000,0.000,WPos:0.000,0.000,0.000>\r\n")
 
 
+def test_a_grbl_of_version_0_9_is_named_by_its_banner(bench):
+    bench.device._say("Grbl 0.9j ['$' for help]")
+    with pytest.raises(FirmwareError, match=r"^Grbl 0\.9j answers: install Grbl 1\.1"):
+        bench.stage()
+
+
 def test_homing_some_axes_needs_firmware_that_can():
     stage = Bench(options=WITH_SINGLE_AXIS_HOMING).stage()
     stage.home(["y"])

@@ -609,6 +609,14 @@ def test_the_exposure_is_read_in_the_unit_that_the_camera_states(bench, unit, ex
     assert camera.exposure_s == pytest.approx(exposure_s)
 
 
+def renamed(bench, name):
+    """Return the camera, opened with a feature that has a name of the maker's own."""
+    description = bench.simulator.description
+    for before, after in ((b'"', b'"'), (b">", b"<")):
+        description = description.replace(before + name + after, before + b"Own" + name + after)
+    return described_as(bench, bench.simulator.description, description)
+
+
 def test_a_gain_that_is_no_decibels_is_linear(bench):
     camera = described_as(bench, b"<Unit>dB</Unit>", b"<Unit>x</Unit>")
     camera.set_gain(4.0)
@@ -616,10 +624,10 @@ def test_a_gain_that_is_no_decibels_is_linear(bench):
 
 
 def test_a_camera_without_gain_or_black_level_has_gain_1_and_black_0(bench):
-    camera = described_as(bench, b'Name="Gain"', b'Name="Gein"')
+    camera = renamed(bench, b"Gain")
     assert (camera.gain, camera.gain_limits) == (1.0, (1.0, 1.0))
     camera.close()
-    camera = described_as(bench, b'Name="BlackLevel"', b'Name="BleckLevel"')
+    camera = renamed(bench, b"BlackLevel")
     assert camera.snap().black_level_dn[1, 1] == 0
 
 
@@ -632,7 +640,7 @@ def test_a_black_level_in_per_cent_is_one_of_white(bench):
 
 def test_a_feature_of_another_kind_than_usual_does_not_stop_the_opening(bench):
     camera = described_as(
-        bench, b'<Port Name="Device"/>', b'<Integer Name="GainSelector"><Value>1</Value></Integer>'
+        bench, b"<Category", b'<Integer Name="GainSelector"><Value>1</Value></Integer><Category'
     )
     np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
 
@@ -657,7 +665,7 @@ def test_ctrl_c_stops_the_camera(bench, monkeypatch, where):
 
 def test_a_camera_without_an_exposure_is_refused(bench):
     with pytest.raises(CameraDescriptionError, match="none of ExposureTime"):
-        described_as(bench, b'"ExposureTime"', b'"ExposureTimf"')
+        renamed(bench, b"ExposureTime")
 
 
 SEEDS = st.integers(0, 1 << 62)

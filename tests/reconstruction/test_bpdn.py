@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emmc_rig.reconstruction.bpdn import BPDNSettings, SensedDictionary, ridge_inverse
+from emmc_rig.reconstruction.bpdn import SEEN_WEAKLY, BPDNSettings, SensedDictionary, ridge_inverse
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.patches import padded
 
@@ -126,9 +126,10 @@ def test_equal_atoms_and_dark_atoms_do_no_harm():
 
 
 def plain_omp(atoms, data, most):
-    """Orthogonal matching pursuit by least squares on the chosen atoms."""
+    """Orthogonal matching pursuit by least squares, for weights of one prior size."""
     chosen, residual = [], data
-    size = np.linalg.norm(atoms, axis=1)
+    norms = np.linalg.norm(atoms, axis=1)
+    size = np.sqrt(norms**2 + SEEN_WEAKLY * np.median(norms) ** 2)
     for _ in range(most):
         chosen.append(int(np.argmax(np.abs(atoms @ residual) / size)))
         weights, *_ = np.linalg.lstsq(atoms[chosen].T, data, rcond=None)
@@ -143,6 +144,15 @@ def test_matching_pursuit_agrees_with_least_squares_on_the_chosen_atoms(most):
     atoms, data, _ = problem(300, 45, sparsity=12)
     code = solve_bpdn(atoms, data, settings=BPDNSettings(method="omp", atoms=most))
     np.testing.assert_allclose(code.weights, plain_omp(atoms, data, most), atol=2e-5)
+
+
+def test_matching_pursuit_does_not_explain_readings_by_an_atom_that_is_hardly_seen():
+    atoms, data, planted = problem(300, 80, sparsity=5)
+    atoms[17] = data + 0.3 * np.random.default_rng(0).standard_normal(80) * np.std(data)
+    atoms[17] *= 1e-2 / np.linalg.norm(atoms[17])
+    found = solve_bpdn(atoms, data, settings=BPDNSettings(method="omp", atoms=5)).weights
+    np.testing.assert_allclose(found, planted, atol=0.02)
+    assert planted[17] == 0
 
 
 @pytest.mark.parametrize("method", ["omp", "sl0", "lars"])

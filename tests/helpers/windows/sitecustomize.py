@@ -13,6 +13,7 @@ import importlib
 import os
 import re
 import signal
+import socket
 import sys
 import types
 import warnings
@@ -111,6 +112,7 @@ WINDOWS = {
     ),
     "psutil": windows_psutil,
     "signal": lambda: WindowsModule(signal, POSIX_SIGNALS, Signals=SIGNALS),
+    "socket": lambda: WindowsModule(socket, re.compile("AF_UNIX|SO_REUSEPORT|TCP_USER_TIMEOUT")),
     "sys": lambda: WindowsModule(sys, re.compile("abiflags"), platform="win32"),
 }  # fmt: skip
 made = {}
