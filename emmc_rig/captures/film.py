@@ -50,6 +50,8 @@ LATE = "the bench was not ready at that time"
 SENT_TWICE = "identical to the frame before it"
 INTERRUPTED = "the film was interrupted"
 HOST_CLOCK = "film: times by the host clock, for the camera states none: some ms to a period late"
+LONGEST_DELAY_S = 60.0
+"""Of a frame's arrival by the camera's clock: no camera's buffer holds as long a stream."""
 LATE_SHARE = 0.5
 """Of a period: a frame that arrives later than this would have another time by the host clock."""
 
@@ -184,6 +186,8 @@ class Ring:
                     self._skipped |= {*range(before + 1, place)}
                 if place < before:
                     raise CaptureError("its time stamps run backwards", "open the camera again")
+                if delay_s - least_delay_s > LONGEST_DELAY_S:
+                    raise CaptureError("its clock stands still", "open the camera again")
                 if place <= last:
                     yield Arrived(place, at_s - first_s, frame, delay_s - least_delay_s)
                 if self._places.start + passed >= last or self._stopped.is_set():

@@ -46,6 +46,7 @@ REQUEST_S = 5.0
 READING_S = 20.0
 """An answer of which a client has read nothing for so long is given up, on Linux by its kernel."""
 LAST_STATE_S = 1.0
+"""For clients to read the last state once the server ends."""
 MOST_CONNECTIONS = 128
 """An eighth of the 1,024 files that Linux lets a program open; a browser opens six."""
 MOST_WAITING = 64

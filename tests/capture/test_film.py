@@ -359,6 +359,15 @@ def test_times_of_a_camera_without_a_clock_are_the_hosts_and_said_to_be():
     assert not of_kind(session.journal.entries, LateEntry)
 
 
+def test_a_cameras_clock_that_stands_still_ends_the_segment():
+    camera = Stream([5.0] * 4, host_s=[50.0, 50.1, 111.0, 112.0])
+    with (
+        Ring(camera, 10.0, range(6), room=9) as ring,
+        pytest.raises(CaptureError, match="clock stands still"),
+    ):
+        arrived(ring)
+
+
 def test_a_frame_that_the_camera_sends_twice_is_dropped():
     session, _ = filmed(
         Stream([place / 10 for place in range(5)], values=[300, 301, 301, 302, 303])
