@@ -355,6 +355,9 @@ def test_a_capture_that_runs_into_a_switch_stops_there_and_does_not_home_into_it
     controller.start()
     line = refused(capture(run, controller, [(-45_000, 0)]))
     assert line.endswith("`emmc-rig devices free mask_x --direction up --stage rig.yaml`")
+    # The same command again begins on the switch, and homes as little.
+    again = refused(capture(run, controller, [(-45_000, 0)]))
+    assert again.endswith("`emmc-rig devices free mask_x --stage rig.yaml`")
     x_mm = [x for x, _, _ in controller.places_mm()]
     hit = next(place for place, mm in enumerate(x_mm) if mm < LOWER_SWITCH_MM + NEAR_MM)
     assert x_mm[hit:] == pytest.approx([LOWER_SWITCH_MM] * len(x_mm[hit:]), abs=NEAR_MM)
