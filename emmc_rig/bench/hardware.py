@@ -508,7 +508,7 @@ def probe_port(port: str) -> str:
                 except FirmwareError as error:
                     return f"{protocol}: {error}"
                 except GarbledReplyError as error:
-                    if error.raw.startswith(REPORT_BEGINS):
+                    if protocol == "grbl" and error.raw.startswith(REPORT_BEGINS):
                         return f"{protocol}: {error}"
                     _log.debug("%s is no %s: %s", port, protocol, error)
                 except DriverError as error:

@@ -224,6 +224,15 @@ def test_probing_names_what_answers(run, protocol, firmware, reported):
     assert reported in out
 
 
+def test_probing_names_a_grbl_whose_numbers_cannot_be_read(run):
+    device = GrblController(SYSTEM_CLOCK)
+    device._coordinates = lambda position_mm, unit: "0;000,0;000,0;000"
+    with PtyServer(device) as server:
+        out = done(run("probe", server.port))
+    assert "grbl: garbled reply" in out
+    assert "'0;000' is not a number" in " ".join(out.split())
+
+
 def test_probing_asks_a_known_adapter_in_its_own_protocol_only(monkeypatch):
     chain = ZaberChain(SYSTEM_CLOCK)
     asked = []
