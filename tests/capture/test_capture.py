@@ -171,7 +171,7 @@ def test_a_resume_agrees_with_the_last_whiteboard_under_other_noise(undisturbed)
     rig, _ = bench_rig(seed=1)
     again = Session(session.folder, session.disk)
     Sequencer(again, plan, rig).run()
-    assert again.read("shot-0-e0-r0") != frames_in(undisturbed[0])["shot-0-e0-r0"]
+    assert frames_in(again)["shot-0-e0-r0"] != frames_in(undisturbed[0])["shot-0-e0-r0"]
     entry = next(iter(of_kind(again.journal.entries, ComparedEntry)))
     assert entry.kind == "registered"
     assert entry.id.startswith("board")

@@ -87,6 +87,11 @@ GUARDS = (
     "moved by hand (by_hand: false): write by_hand: true",  # refused before a session is made
     "shows the shadow through ",  # walked in test_by_hand.py
     "shows the mask ",
+    # Refused before a session is made: test_trigger.py, test_capture_lights.py.
+    "does not exist, its driver knows no lines",
+    ": the rig's lights have no ",
+    "the simulated bench has lights of its own: write lights: simulated",
+    "its clock stands still",  # walked in test_film.py
     "an imported session takes no further frames",  # it is complete; its remedy is another import
     "its time stamps run backwards",  # walked in test_film.py
     "no file of it is frame ",  # frames without a file are not taken, but for --until

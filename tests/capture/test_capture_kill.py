@@ -7,6 +7,7 @@ import signal
 import numpy as np
 import pytest
 from capture_kills import HOOKED, capture_into
+from capture_rigs import frame_in
 from programs import line_server
 
 from emmc_rig.session.journal import HookEntry, of_kind
@@ -37,8 +38,8 @@ def undisturbed(memory_folder):
 
 
 def contents(session):
-    """Every file of the frames folder, and its bytes."""
-    return {path.name: path.read_bytes() for path in (session.folder / FRAMES).iterdir()}
+    """Every file of the frames folder, and the frame in it."""
+    return {path.name: frame_in(path.read_bytes()) for path in (session.folder / FRAMES).iterdir()}
 
 
 def assert_made_whole(folder, expected):

@@ -51,9 +51,9 @@ WRITERS = {
     "tables": ("--fast",),
 }  # fmt: skip
 READERS = {
-    "devices camera", "devices check", "devices conform", "devices home", "devices info",
-    "devices jog", "devices list", "devices probe", "devices udev-rule", "live", "session list",
-    "session show", "session verify",
+    "devices camera", "devices check", "devices conform", "devices free", "devices home",
+    "devices info", "devices jog", "devices lights", "devices list", "devices probe",
+    "devices udev-rule", "live", "session list", "session show", "session verify",
 }  # fmt: skip
 JOURNALS = {
     "chart": "points.jsonl",

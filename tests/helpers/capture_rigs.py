@@ -17,6 +17,7 @@ from emmc_rig.captures.plan import Plan, planned_camera
 from emmc_rig.captures.run import CaptureRequest, new_session, planned_frames
 from emmc_rig.drivers.camera import CameraIdentity, RawFileCamera
 from emmc_rig.drivers.dng import encode_dng
+from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.simulators.clock import ManualClock
 from emmc_rig.simulators.still import StillStage
 
@@ -151,5 +152,12 @@ def begun(folder, disk, rig, text=PLAN_YAML):
 
 
 def frames_in(session):
-    """Return the bytes of each frame that a session needs, by the frame's name."""
-    return {frame.id: session.read(frame.id) for frame in session.needed}
+    """Return each frame that a session needs, by the frame's name, without its time."""
+    return {frame.id: frame_in(session.read(frame.id)) for frame in session.needed}
+
+
+def frame_in(data):
+    """Return what a frame's file says of the light, without when: mosaic, levels, exposure."""
+    frame = decode_raw(data)
+    levels = frame.black_level_dn.tobytes(), frame.white_level_dn
+    return frame.mosaic.tobytes(), frame.mosaic.shape, levels, frame.exposure_s, frame.gain
