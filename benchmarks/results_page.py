@@ -346,7 +346,7 @@ def noise_and_shots() -> Section:
 
 
 WITHIN_ONE, ABOUT = 0.6827, 0.08
-"""Share of errors within one deviation, if they are Gaussian, and its tolerance."""
+"""Share of Gaussian errors within one deviation, and the tolerance of a measured share."""
 
 
 def stated() -> Section:

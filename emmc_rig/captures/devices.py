@@ -58,7 +58,7 @@ def with_trigger(rig: RigType, plan: Plan) -> RigType:
         for key, method, arguments in wanted:
             try:
                 if not hasattr(camera, method):
-                    raise CameraSettingError(key, "does not exist, its driver knows no lines")
+                    raise CameraSettingError(key, "is not supported by its driver")
                 getattr(camera, method)(*arguments)
             except CameraSettingError as fault:
                 remedy = f"change {key} in the plan, or leave it out"

@@ -88,7 +88,7 @@ GUARDS = (
     "shows the shadow through ",  # walked in test_by_hand.py
     "shows the mask ",
     # Refused before a session is made: test_trigger.py, test_capture_lights.py.
-    "does not exist, its driver knows no lines",
+    "is not supported by its driver",
     ": the rig's lights have no ",
     "the simulated bench has lights of its own: write lights: simulated",
     "its clock stands still",  # walked in test_film.py
