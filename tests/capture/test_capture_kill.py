@@ -76,7 +76,7 @@ def test_a_capture_killed_at_random_lines_of_the_storing_code_is_made_whole(
 
 
 @pytest.mark.slow
-def test_a_capture_with_a_hook_and_by_hand_killed_at_any_step_is_made_whole_with_the_same_bytes(
+def test_a_capture_with_a_hook_and_by_hand_killed_at_any_step_is_made_whole(
     killed, memory_folder, undisturbed
 ):
     code, steps = killed("step", 0, memory_folder / f"all-steps-{HOOKED}")

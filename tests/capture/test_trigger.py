@@ -146,7 +146,7 @@ def test_lines_that_the_camera_lacks_are_refused_by_name(key, value, message):
 
 def test_a_camera_without_lines_is_refused():
     rig, (plan, _) = still_rig(), plan_and_camera(SHOTS)
-    with pytest.raises(AppError, match="trigger: the camera's trigger does not exist, its driver"):
+    with pytest.raises(AppError, match="trigger: the camera's trigger is not supported by its driver"):
         with_trigger(rig, plan)
     assert (
         with_trigger(rig, plan.model_copy(update={"trigger": None, "exposure_output": None})) is rig
@@ -190,5 +190,5 @@ def test_a_triggered_plan_runs_from_the_command_line(run, tmp_path):
     assert "complete: 5 frames" in done(run("capture", "plan.yaml", *rig))
     (tmp_path / "ptp.yaml").write_text("kind: simulated\n")
     line = refused(run("capture", "plan.yaml", "--rig", "ptp.yaml", "--out", "other", *rig[2:]))
-    assert "trigger: the camera's trigger does not exist" in line
+    assert "trigger: the camera's trigger is not supported by its driver" in line
     assert not (tmp_path / "other").exists()
