@@ -146,7 +146,9 @@ def test_lines_that_the_camera_lacks_are_refused_by_name(key, value, message):
 
 def test_a_camera_without_lines_is_refused():
     rig, (plan, _) = still_rig(), plan_and_camera(SHOTS)
-    with pytest.raises(AppError, match="trigger: the camera's trigger is not supported by its driver"):
+    with pytest.raises(
+        AppError, match="trigger: the camera's trigger is not supported by its driver"
+    ):
         with_trigger(rig, plan)
     assert (
         with_trigger(rig, plan.model_copy(update={"trigger": None, "exposure_output": None})) is rig
