@@ -218,7 +218,15 @@ def stages_of_rig(spec: str) -> list[Any] | None:
     if not isinstance(read, dict) or "protocol" in read or "stage" not in read:
         return None
     named = read["stage"]
-    return named if isinstance(named, list) else [named]
+    return [file_beside(stage, spec) for stage in (named if isinstance(named, list) else [named])]
+
+
+def file_beside(device: Any, rig: str) -> Any:
+    """Return a device, the name of a file that lies beside the rig's file as a whole path."""
+    beside = Path(rig).parent
+    if isinstance(device, str) and (beside / device).is_file():
+        return str((beside / device).resolve())
+    return device
 
 
 def _require_actuators(axes: Any, source: str) -> None:

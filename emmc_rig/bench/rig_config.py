@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
-from emmc_rig.bench.device_config import lights_of
+from emmc_rig.bench.device_config import file_beside, lights_of
 from emmc_rig.bench.environment import Source, SourceConfig
 from emmc_rig.bench.hands import Ask, AskingAttendant, NoAttendant
 from emmc_rig.bench.hardware import (
@@ -224,11 +224,11 @@ def rig_description(spec: str, imaged: ImagedRig) -> dict[str, Any]:
         more = {name: getattr(given, name) for name in LATER}
         return _described(SIMULATED, _of_now(imaged.model_copy(update=more)))
     described = _described("real", validated(RealRig, read, spec, AppError))
-    found = [_file_of_rig(stage, Path(spec).parent) for stage in _several(described["stage"])]
+    found = [file_beside(stage, spec) for stage in _several(described["stage"])]
     described["stage"] = found if isinstance(described["stage"], list) else found[0]
     camera = described["camera"]
     if isinstance(camera, dict) or not Path(camera).is_file():
-        described["camera"] = _file_of_rig(camera, Path(spec).parent)
+        described["camera"] = file_beside(camera, spec)
     return described
 
 
@@ -249,13 +249,6 @@ def _real_pupil(imaged: ImagedRig, camera: Camera) -> Pupil:
 
 def _several(stages: StageSpec | list[StageSpec]) -> list[StageSpec]:
     return stages if isinstance(stages, list) else [stages]
-
-
-def _file_of_rig(device: str | dict[str, Any], beside: Path) -> str | dict[str, Any]:
-    """Return a stage or camera, the name of a file that lies beside the rig's as a whole path."""
-    if isinstance(device, str) and (beside / device).is_file():
-        return str((beside / device).resolve())
-    return device
 
 
 def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:

@@ -144,6 +144,12 @@ def test_the_stages_of_a_rigs_file_are_those_of_its_captures(run, tmp_path):
     assert (code, "two stages have an axis x" in one_line(err)) == (1, True)
     (tmp_path / "rig.yaml").write_text("stage: simulated:grbl\ncamera: simulated\n")
     assert "unknown" in done(run("info", "--stage", "rig.yaml"))
+    (tmp_path / "bench").mkdir()
+    (tmp_path / "bench/rig.yaml").write_text("stage: stage.yaml\ncamera: simulated\n")
+    (tmp_path / "bench/stage.yaml").write_text("{protocol: grbl, port: /dev/no-such-port}\n")
+    code, _, err = run("info", "--stage", "bench/rig.yaml")
+    assert code == 1
+    assert "/dev/no-such-port" in err
 
 
 @pytest.mark.slow
