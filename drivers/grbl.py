@@ -636,11 +636,18 @@ class _Controller:
 def identify(transport: Transport, clock: Clock = SYSTEM_CLOCK) -> str:
     """Return version and options of the Grbl on a port; moves nothing, and resets nothing.
 
-    Raises `TransportTimeoutError` or `GarbledReplyError` when no Grbl is there.
+    Raises `TransportTimeoutError` or `GarbledReplyError` when no Grbl is there, `FirmwareError`
+    when a Grbl is there whose status cannot be read.
     """
     controller = _Controller(transport, clock, _log.info)
-    controller.wait_for_status()
-    options = controller.command("$I")
+    try:
+        controller.wait_for_status()
+        options = controller.command("$I")
+    except GarbledReplyError as fault:
+        if not fault.raw.startswith(codec.REPORT_BEGINS):
+            raise
+        about = {"axis": fault.axis, "command": fault.command, "reply": fault.reply}
+        raise FirmwareError(fault.what, fault.advice).about(**about) from fault
     return f"version {options.get('VER', 'unknown')}, options {options.get('OPT', 'unknown')}"
 
 

@@ -22,6 +22,8 @@ JOG_CANCEL = b"\x85"
 STATES = ("Idle", "Run", "Hold", "Jog", "Alarm", "Door", "Check", "Home", "Sleep")
 AXIS_LETTERS = "XYZABC"
 MM_PER_INCH = 25.4
+REPORT_BEGINS = b"<"
+"""A status report, of Grbl and of firmware derived from it."""
 NEWER_FIRMWARE = "install Grbl 1.1 or grblHAL on it"
 
 SOFT_LIMITS, HARD_LIMITS, HOMING, HOMING_DIRECTIONS = 20, 21, 22, 23

@@ -218,11 +218,7 @@ class MicroManagerLights(Lights):
         self._closed = False
         try:
             for label in filter(None, (shutter, device)):
-                if label not in (known := loaded.core.getLoadedDevices()):
-                    raise LightError(
-                        f"{loaded.port} has no device {label!r}",
-                        f"name one of {', '.join(known)} under lights: in the rig's file",
-                    )
+                loaded.check_loaded(label, "device", " under lights: in the rig's file", LightError)
             loaded.whenever_loaded(self._keep_shutter)
         except BaseException:
             loaded.close()

@@ -26,6 +26,7 @@ from emmc_rig.drivers.errors import (
     CameraClosedError,
     CameraSettingError,
     CaptureError,
+    DriverError,
     MicroManagerError,
     PortGoneError,
     SpeedFixedError,
@@ -76,6 +77,22 @@ class LoadedCore:
         if self._core is None:
             raise PortGoneError(self.port)
         return self._core
+
+    def check_loaded(
+        self,
+        label: str,
+        kind: str,
+        where: str = "",
+        error: type[DriverError] = MicroManagerError,
+    ) -> None:
+        """Raise an error that names the devices there are, unless a device has this label.
+
+        kind: of the device. where: in which file the label is to be mended.
+        """
+        known = self.core.getLoadedDevices()
+        if label not in known:
+            advice = f"name one of {', '.join(known)}{where}"
+            raise error(f"{self.port} has no {kind} {label!r}", advice)
 
     def whenever_loaded(self, apply: Callable[[], None]) -> None:
         """Apply settings now, and again after every reload until `forget`."""
@@ -210,11 +227,7 @@ class MicroManagerCamera:
         self._closed = False
         try:
             self.label = setup.label or loaded.core.getCameraDevice()
-            if self.label not in loaded.core.getLoadedDevices():
-                raise MicroManagerError(
-                    f"{loaded.port} has no camera {self.label!r}",
-                    f"name one of {', '.join(loaded.core.getLoadedDevices())}",
-                )
+            loaded.check_loaded(self.label, "camera")
             loaded.whenever_loaded(self._apply)
         except BaseException:
             loaded.close()

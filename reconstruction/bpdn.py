@@ -46,7 +46,7 @@ INNER_SHARE = 0.5
 """Share of the tolerance to which ADMM solves a working set."""
 DEPENDENT = 1e-3
 """An atom adds nothing if chosen atoms explain all but this share of its norm."""
-SEEN_WEAKLY = 0.7
+CHOICE_RIDGE = 0.7
 """Ridge of OMP's choice, over the square of the median norm of sensed atoms.
 
 An atom of prior variance s^2 raises the likelihood of a residual r by
@@ -482,7 +482,7 @@ class _Omp(_Solver):
         norms = self.sensed.norms
         lit = norms > DARKEST * norms.max()
         self.inverse_norms = np.where(lit, 1 / np.where(lit, norms, 1), 0).astype(np.float32)
-        ridge = SEEN_WEAKLY * self.sensed.typical_norm**2
+        ridge = CHOICE_RIDGE * self.sensed.typical_norm**2
         self.scale = np.where(lit, 1 / np.sqrt(np.square(norms) + ridge), 0).astype(np.float32)
         self.most_steps = min(self.settings.atoms, self.measured, *self.atoms.shape)
         self.basis = np.empty((self.most_steps, self.data.size))

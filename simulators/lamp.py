@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable
 
 from emmc_rig.drivers.clock import Clock
+from emmc_rig.drivers.lights import COLOURS
 from emmc_rig.simulators.firmware import SimulatedController, earliest_s
 from emmc_rig.simulators.wire import MemoryTransport
 
@@ -15,10 +16,7 @@ ANSWER_S = 0.4
 STROBE_S, PULSE_S = 0.1, 0.01
 """Period and length of the pulses on the trigger output, which runs as long as the sketch does."""
 READY = "lamp ready"
-LAMP_EXCHANGES = {
-    colour: {"send": f"{colour}\n", "expect": f"ok {colour}"}
-    for colour in ("off", "white", "red", "green", "blue")
-}
+LAMP_EXCHANGES = {colour: {"send": f"{colour}\n", "expect": f"ok {colour}"} for colour in COLOURS}
 """By colour: the text that sets it, and the answer, as in a rig's file."""
 
 

@@ -50,12 +50,7 @@ from emmc_rig.drivers.cameras import CAMERA_HELP, CAMERAS
 from emmc_rig.drivers.clock import SYSTEM_CLOCK, Clock
 from emmc_rig.drivers.combined import CombinedStage
 from emmc_rig.drivers.dng import SMALLEST_SIDE_PX
-from emmc_rig.drivers.errors import (
-    DriverError,
-    FirmwareError,
-    GarbledReplyError,
-    TransportTimeoutError,
-)
+from emmc_rig.drivers.errors import DriverError, FirmwareError, TransportTimeoutError
 from emmc_rig.drivers.grbl import GrblStage
 from emmc_rig.drivers.grbl import identify as identify_grbl
 from emmc_rig.drivers.lights import (
@@ -106,8 +101,6 @@ POSITION_TOLERANCE_UM, GRBL_TOLERANCE_UM = 0.5, 2.0
 SIMULATED = "simulated"
 NO_STAGE = "none"
 PROBE_TIMEOUT_S = 0.2
-REPORT_BEGINS = b"<"
-"""A status report of Grbl, or of firmware that is derived from it."""
 MICROMETER = 0.1
 """By how much surer a hand puts a mask on its micrometer than a pinhole on its hole."""
 PUPIL_OF_VIEWS = 10 / 7
@@ -507,10 +500,6 @@ def probe_port(port: str) -> str:
                         return f"{protocol}: {answer}"
                 except FirmwareError as error:
                     return f"{protocol}: {error}"
-                except GarbledReplyError as error:
-                    if protocol == "grbl" and error.raw.startswith(REPORT_BEGINS):
-                        return f"{protocol}: {error}"
-                    _log.debug("%s is no %s: %s", port, protocol, error)
                 except DriverError as error:
                     _log.debug("%s is no %s: %s", port, protocol, error)
     return ""

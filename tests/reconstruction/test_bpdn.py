@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emmc_rig.reconstruction.bpdn import SEEN_WEAKLY, BPDNSettings, SensedDictionary, ridge_inverse
+from emmc_rig.reconstruction.bpdn import CHOICE_RIDGE, BPDNSettings, SensedDictionary, ridge_inverse
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.patches import padded
 
@@ -129,7 +129,7 @@ def plain_omp(atoms, data, most):
     """Orthogonal matching pursuit by least squares, for weights of one prior size."""
     chosen, residual = [], data
     norms = np.linalg.norm(atoms, axis=1)
-    size = np.sqrt(norms**2 + SEEN_WEAKLY * np.median(norms) ** 2)
+    size = np.sqrt(norms**2 + CHOICE_RIDGE * np.median(norms) ** 2)
     for _ in range(most):
         chosen.append(int(np.argmax(np.abs(atoms @ residual) / size)))
         weights, *_ = np.linalg.lstsq(atoms[chosen].T, data, rcond=None)
