@@ -1,7 +1,7 @@
 """Films of light fields against the same frames, each reconstructed alone: accuracy, rest, cost.
 
-A window of a light field rests, slides by fractions of a pixel, or slides while a disc of the next
-light field passes before it at another speed and disparity; of a built-in scene that moves, the
+A window of a light field rests, slides by fractions of a pixel, or a disc of the next light field
+passes before it at another speed and disparity, while it slides ("passes") or rests ("crosses"); of a built-in scene that moves, the
 scene itself, whatever the motion. The exact light field of every frame is known.
 """
 
@@ -23,8 +23,11 @@ from emmc_rig.reconstruction.adaptive.film import Film
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
 from emmc_rig.simulators.scenes import MOVING_SCENES, SCENES, render
 
-RESTS, CREEPS, PANS, PASSES = "rests", "creeps", "pans", "passes"
-PAN_PX = {RESTS: (0.0, 0.0), CREEPS: (0.03, 0.1), PANS: (0.45, 1.4), PASSES: (0.2, -0.6)}
+RESTS, CREEPS, PANS, PASSES, CROSSES = "rests", "creeps", "pans", "passes", "crosses"
+PAN_PX = {
+    RESTS: (0.0, 0.0), CREEPS: (0.03, 0.1), PANS: (0.45, 1.4), PASSES: (0.2, -0.6),
+    CROSSES: (0.0, 0.0),
+}  # fmt: skip
 """By how much the window's content moves per frame, along y and x."""
 DISC_PX, DISC_DISPARITY, DISC_RADIUS = (-0.3, 1.7), 1.5, 0.28
 """Of the disc: motion per frame, how much nearer it is, radius over the window's rows."""
@@ -59,7 +62,7 @@ def frame_of(scene: str, other: str, motion: str, size: tuple[int, int], frame: 
         return render(scene, (5, 5), size, time_s=frame / MOVING_HZ).light_field
     whole, move = opened(scene), np.array(PAN_PX[motion]) * frame
     out = window(whole, size, move)
-    if motion != PASSES:
+    if motion not in (PASSES, CROSSES):
         return out
     passed = np.array(DISC_PX) * frame
     disc = window(opened(other), size, passed, DISC_DISPARITY)

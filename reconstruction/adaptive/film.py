@@ -42,6 +42,7 @@ from emmc_rig.reconstruction.adaptive.joint import (
 )
 from emmc_rig.reconstruction.adaptive.parts import from_arrays, to_arrays
 from emmc_rig.reconstruction.adaptive.rays import Surfaces
+from emmc_rig.reconstruction.adaptive.resting import Rest
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.adaptive.survey import Plain, checked, plain_of, unseen_by
 from emmc_rig.reconstruction.adaptive.sweep import STRIDE, mean_around, swept
@@ -50,13 +51,13 @@ from emmc_rig.reconstruction.adaptive.times import (
     OtherTime,
     at_places,
     flow_between,
-    of_samples,
     padded,
     rested,
     sampled,
 )
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import Readings
+from emmc_rig.reconstruction.result import Reconstruction
 
 Array = NDArray[np.floating]
 
@@ -95,17 +96,8 @@ on a frame begins anew."""
 STILL = 1.05
 """Ratio of the squared residual of the scene carried without flow to that of the scene carried with
 it, up to which nothing flows."""
-UNCHANGED = 1.4, 2.5
-"""Mean square change of the readings over that by noise, up to which a place rests: with flow, and
-without. Noise alone makes it 0.5 to 1.4, and up to 2 where bright and dark readings have one
-deviation; a pan that moves texture by 1.5 pixels makes it 13 and more."""
-CAMERA_RESTS = 0.75
-"""Share of resting pixels from which on the scene rests: 0.98 to 1 at rest, up to 0.6 while smooth
-scenes pan."""
 RESTING_PX = 0.25
 """Flow up to which the light field of the frame before stands for that of the present one."""
-LONGEST = 8
-"""Frames at rest over which light fields are averaged, about."""
 WORSE, MOVING_SHARE = 1.2, 0.02
 """Residual of a following frame over that of first frames, from which on the film begins anew: with
 this limit films of group A that pan lose 0.01 dB, and `panning-desk` loses 4.9 dB less (96x128,
@@ -116,28 +108,6 @@ follows has one. Films of group A (96x128, `benchmarks/films.py`) stated 3.2 to 
 their frames alone did, beside what each reached."""
 ROOM_PX = 1.0
 """By which disparities may grow while a film goes on."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rest:
-    """What stands as long as the scene rests.
-
-    Attributes:
-        first: light field of the frame since which the scene rests, as `mixture.stored`.
-        mean: of the light fields of about `count` fits since then, as `mixture.stored`.
-        readings: of the first frame, over the scale, (1, pixel_y, pixel_x).
-        count: of frames in the mean, at most LONGEST.
-    """
-
-    first: NDArray[np.uint16]
-    mean: NDArray[np.uint16]
-    readings: Array
-    count: int = 1
-
-    @property
-    def next_count(self) -> int:
-        """Number of frames in the mean after one more."""
-        return min(self.count + 1, LONGEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,16 +163,12 @@ class Film:
         self,
         plain: Plain,
         scene: FittedScene,
-        light_field: Array,
+        result: Reconstruction,
         beliefs: search.Volume,
         missed: float,
         earlier: Sequence[OtherTime] = (),
-        rest: Rest | None = None,
     ) -> Film:
-        """Return what is known after a frame; earlier: frames before, none of a first one.
-
-        rest: the parts at rest, None where unknown.
-        """
+        """Return what is known after a frame; earlier: frames before, none of a first one."""
         margin, texture = scene.surfaces.margin, scene.clean
         if self.known is not None:
             missed = min(missed, self.known.missed)
@@ -216,9 +182,7 @@ class Film:
         used = plain.given.usable & ~plain.held
         this = OtherTime(plain.bright, used, plain.picture, still, still)
         kept = (*earlier, this)[-max(self.settings.earlier, self.settings.together) :]
-        if rest is None:
-            seen = mixture.stored(light_field)
-            rest = Rest(seen, seen, plain.bright.frames)
+        rest = Rest.of(result, plain.given.frames, plain.picture)
         known = Known(plain.scale, margin, rest, texture, centre, beliefs, missed, kept)
         return replace(self, known=known)
 
@@ -254,10 +218,6 @@ class Followed:
         earlier: frames before, with the flow to this one.
         moving: readings that were fitted where something moves, (shot, pixel_y, pixel_x).
         parameters: figures that the result reports.
-        scene_left: the scene that the next frame starts from.
-        beliefs_left: the beliefs that the next frame starts from.
-        mean: light field of what rests, see `Rest`.
-        still: where the scene rests, (pixel_y, pixel_x).
     """
 
     plain: Plain
@@ -266,10 +226,6 @@ class Followed:
     earlier: list[OtherTime]
     moving: NDArray[np.bool_]
     parameters: dict[str, float]
-    scene_left: FittedScene
-    beliefs_left: search.Volume
-    mean: NDArray[np.uint16]
-    still: NDArray[np.bool_]
 
     def worse(self, before: Known, light_field: Array) -> bool:
         """Return whether its light field leaves more where something moves than the first did."""
@@ -287,15 +243,7 @@ class Followed:
         Fits that go on from each other lose more than so little motion gains: films that pan by
         0.1 pixels a frame are up to 1.5 dB better for it (buttercup), or 0.9 (dragons).
         """
-        return self.parameters["flow_px"] < RESTING_PX and not self.still.any()
-
-    def rest(self, before: Known, light_field: Array) -> Rest:
-        """Return what stands at rest for the next frame, from the frame's light field."""
-        disparity, seen = self.fits.scene.surfaces.disparity, mixture.stored(light_field)
-        resting = of_samples(self.still, light_field[0, 0]).astype(np.float32)
-        first = _standing(before.rest.first, seen, disparity, resting)
-        readings = np.where(self.still, before.rest.readings, self.plain.bright.frames)
-        return Rest(first, self.mean, readings, before.rest.next_count)
+        return self.parameters["flow_px"] < RESTING_PX
 
 
 class CarriedScene(NamedTuple):
@@ -313,18 +261,16 @@ class CarriedScene(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Flows between the frame before and the present one, and where nothing moves.
+    """Flows between the frame before and the present one.
 
     Attributes:
         there: flow from the frame before to the present one, (y, x, 2).
         back: flow from the present frame to the one before, (y, x, 2).
-        still: where the readings rest, (pixel_y, pixel_x).
         scene: the surfaces, carried along `back`.
     """
 
     there: Array
     back: Array
-    still: NDArray[np.bool_]
     scene: CarriedScene
 
 
@@ -347,14 +293,14 @@ def followed(
     margin, nearer = before.margin, 1 if settings.nearer == "larger" else -1
     plain = plain_of(given, before.scale, unseen_by(given), settings.start_steps)
     bright, used = plain.bright, given.usable & ~plain.held
-    there, back, still, carried_scene = _motion(before, plain, used, nearer)
+    there, back, carried_scene = _motion(before, plain, used, nearer)
     centre, texture = carried_scene.centre, carried_scene.texture
     new = _share_new(carried_scene.missed, plain)
     if new > NEW_SHARE:
         return None
     earlier = [frame.since(there, back) for frame in before.earlier[-own.earlier :]]
     seen = [frame.seen(centre, margin, texture, nearer, own.misfit) for frame in earlier]
-    carried_beliefs = beliefs = _carried(before.beliefs, back, still, psi.binning)
+    beliefs = _carried(before.beliefs, back, psi.binning)
     fitted = replace(bright, usable=used)
 
     def again(texture: Array, surfaces: Surfaces) -> Array:
@@ -377,13 +323,7 @@ def followed(
         margin=margin,
     )
     scene.surfaces.release()
-    fits = _models(before, plain, scene, still, back)
-    stays = of_samples(still, scene.centre)
-    scene_left = replace(
-        scene,
-        clean=np.where(np.pad(stays, margin, mode="edge"), texture, scene.clean),
-        centre=np.where(stays, centre[inner], scene.centre),
-    )
+    fits = _models(before, plain, scene, back)
     k = psi.binning
     return Followed(
         plain=plain,
@@ -394,17 +334,12 @@ def followed(
         parameters={
             "flow_px": float(np.median(np.linalg.norm(there, axis=-1))),
             "new_share": new,
-            "still_share": float(still.mean()),
         },
-        scene_left=scene_left,
-        beliefs_left=_kept(carried_beliefs, beliefs, still[::STRIDE, ::STRIDE]),
-        mean=fits.light_fields[0],
-        still=still,
     )
 
 
 def _motion(before: Known, plain: Plain, used: NDArray[np.bool_], nearer: int) -> Motion:
-    """Return the flow since the frame before, 0 where the scene rests, and the scene it carries.
+    """Return the flow since the frame before, and the scene it carries.
 
     A place flows where the squared residual of the scene carried without flow exceeds STILL times
     that of the scene carried with it, in the mean around. used: readings that are fitted.
@@ -425,33 +360,23 @@ def _motion(before: Known, plain: Plain, used: NDArray[np.bool_], nearer: int) -
         for carried in (scene, unmoved)
     )
     flows = missed_unmoved > STILL * missed
-    still = _still(bright, before.rest.readings, used & before.earlier[-1].used, flows)
-    rests = still | ~flows
-    if rests.any():
-        there, back = rested(there, back, rests.astype(np.float32))
+    if not flows.all():
+        there, back = rested(there, back, (~flows).astype(np.float32))
         scene = carried_along(back)
-    return Motion(there, back, still, scene)
+    return Motion(there, back, scene)
 
 
-def _models(
-    before: Known, plain: Plain, scene: FittedScene, still: NDArray[np.bool_], back: Array
-) -> Fits:
+def _models(before: Known, plain: Plain, scene: FittedScene, back: Array) -> Fits:
     """Return the models of a frame that follows: two of surfaces, and total variation.
 
-    The first is the mean of the fits while the scene rests. The second has the light field of the
-    first frame at rest where nothing moves. If nothing rests, that stands by exp(-|flow|^2 /
-    RESTING_PX^2). Elsewhere both are the present fit.
+    The first is the present fit. In the second the light field of the frame before stands by
+    exp(-|flow|^2 / RESTING_PX^2).
     """
-    given, rest = plain.given, before.rest
+    given = plain.given
     light_field = scene.surfaces.light_field(np.float32(before.scale) * scene.texture)
     fit = mixture.stored(np.clip(light_field, 0, 1, out=light_field))
-    disparity, count = scene.surfaces.disparity, rest.next_count
-    resting = of_samples(still, light_field[0, 0]).astype(np.float32)
     slow = np.exp(-np.square(back / RESTING_PX).sum(axis=-1))
-    models = [
-        _standing(rest.mean, fit, disparity, resting * (1 - 1 / count)),
-        _standing(rest.first, fit, disparity, resting if still.any() else slow),
-    ]
+    models = [fit, _standing(before.rest.light_field, fit, scene.surfaces.disparity, slow)]
     residuals: list[Array] = [
         given.frames - given.psi.forward(mixture.values(model)) for model in models
     ]
@@ -460,36 +385,19 @@ def _models(
     return Fits(models, residuals, scene, with_patches=False, understated=UNDERSTATED)
 
 
-def _still(
-    bright: Readings, before: Array, used: NDArray[np.bool_], flows: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Return where the scene rests, (pixel_y, pixel_x): nowhere while the camera moves.
-
-    There places without texture change as little. before: readings since which it may rest. flows:
-    where what is carried without motion misses more.
-    """
-    weight = used.astype(np.float32)
-    changed, noise = (
-        mean_around(square, weight)[0]
-        for square in (np.square(bright.frames - before), 2 * bright.noise)
-    )
-    still = changed <= np.where(flows, *UNCHANGED) * noise
-    return still & (np.mean(still | ~flows) >= CAMERA_RESTS)
-
-
 def _standing(
-    before: NDArray[np.uint16], present: NDArray[np.uint16], disparity: Array, still: Array
+    before: NDArray[np.uint16], present: NDArray[np.uint16], disparity: Array, stands: Array
 ) -> NDArray[np.uint16]:
     """Return the light field before by the share of it that stands, the present one by the rest.
 
-    disparity: of the present rays (v, u, y, x). still: share of the centre view (y, x).
+    disparity: of the present rays (v, u, y, x). stands: share of the centre view (y, x).
     """
-    own, views = at_places(still.shape), disparity.shape[:2]
+    own, views = at_places(stands.shape), disparity.shape[:2]
     out = np.empty_like(before)
 
     def work(at: tuple[int, int]) -> None:
         steps = np.array([n - of // 2 for n, of in zip(at, views, strict=True)], np.float32)
-        share = sampled(still, own - disparity[at][..., None] * steps)[..., None]
+        share = sampled(stands, own - disparity[at][..., None] * steps)[..., None]
         out[at] = np.rint(share * before[at] + (1 - share) * present[at])
 
     in_views(work, views)
@@ -508,20 +416,8 @@ def _share_new(foretold: Array, plain: Plain) -> float:
     return float(np.mean(own > others))
 
 
-def _kept(before: search.Volume, now: search.Volume, still: NDArray[np.bool_]) -> search.Volume:
-    """Return beliefs as before where the scene rests (row, column of patches), elsewhere now's."""
-    among, rests = np.isin(before.disparities, now.disparities), still[..., None]
-    chances = np.where(rests, before.probability[..., among], now.probability)
-    return replace(now, probability=chances, evidence=np.log(np.maximum(chances, 1e-20)))
-
-
-def _carried(
-    beliefs: search.Volume, back: Array, still: NDArray[np.bool_], binning: int
-) -> search.Volume:
-    """Return beliefs of the frame before, on every STRIDE-th pixel of the present one.
-
-    still: where the scene rests (pixel_y, pixel_x), and nothing becomes less sure.
-    """
+def _carried(beliefs: search.Volume, back: Array, binning: int) -> search.Volume:
+    """Return beliefs of the frame before, on every STRIDE-th pixel of the present one."""
     rows, columns = (
         np.arange(0, length // binning, STRIDE, dtype=float) for length in back.shape[:2]
     )
@@ -544,8 +440,7 @@ def _carried(
         axis=-1,
     )
     chances /= np.maximum(chances.sum(axis=-1, keepdims=True), 1e-20)
-    kept = np.where(still[::STRIDE, ::STRIDE], np.float32(1), np.float32(KEPT))[..., None]
-    chances = kept * chances + (1 - kept) / np.float32(chances.shape[-1])
+    chances = KEPT * chances + np.float32((1 - KEPT) / chances.shape[-1])
     chances = np.maximum(chances, np.float32(1e-20))
     nearest = tuple(np.rint(part).astype(int) for part in places[0][::-1])
     return replace(

@@ -50,6 +50,7 @@ class Fits:
     scene: FittedScene
     with_patches: bool
     understated: float = 1.0
+    centres: list[Array] = field(default_factory=list)
 
 
 class PlannedFit(NamedTuple):
@@ -100,6 +101,7 @@ def fitted_models(
     patches: Patches | None = None,
     second: search.Volume | None = None,
     others: Sequence[OtherTime] = (),
+    carried: Array | None = None,
 ) -> Fits:
     """Return the fits of surfaces that are planned (`_planned`), and a model without surfaces.
 
@@ -116,7 +118,11 @@ def fitted_models(
     used = replace(bright, usable=given.usable & ~held)
     nearer = 1 if settings.nearer == "larger" else -1
     light_fields, residuals, scene, begun = [], [], None, None
-    for number, planned in enumerate(_planned(survey, settings, second)):
+    plan = _planned(survey, settings, second)
+    if carried is not None:
+        plan[-1] = plan[-1]._replace(centre=carried, sweeps=False)
+    centres = []
+    for number, planned in enumerate(plan):
         # One layout of rays at a time: it is as large as the light field.
         scene = None
         done, misfit = number * settings.texture.steps, planned.misfit
@@ -144,7 +150,8 @@ def fitted_models(
             begun=begun,
             others=seen_by_others,
         )
-        begun = scene.begun if second is None else None
+        begun = scene.begun if second is None and carried is None else None
+        centres.append(scene.centre)
         residuals.append(scale * (bright.frames - scene.surfaces.forward(scene.texture)))
         scene.surfaces.release()
         seen = scene.surfaces.light_field(scale * scene.texture)
@@ -159,7 +166,9 @@ def fitted_models(
     else:
         light_fields.append(survey.plain)
         residuals.append(survey.plain_residual)
-    return Fits(light_fields, residuals, scene, patched)
+    return Fits(
+        light_fields, residuals, scene, patched, centres=centres if carried is not None else []
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,8 +35,10 @@ from emmc_rig.reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
 from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
 from emmc_rig.reconstruction.adaptive.film import Film, followed
 from emmc_rig.reconstruction.adaptive.fits import Fits, Patches, averaged, fitted_models
+from emmc_rig.reconstruction.adaptive.resting import WHOLE, Before, Rest, Window, covered, windows
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.adaptive.survey import (
+    CONTRAST,
     Plain,
     checked,
     checked_disparity,
@@ -44,7 +46,13 @@ from emmc_rig.reconstruction.adaptive.survey import (
     searched_again,
     surveyed,
 )
-from emmc_rig.reconstruction.adaptive.times import OtherTime, moved, of_present, surveyed_together
+from emmc_rig.reconstruction.adaptive.times import (
+    OtherTime,
+    moved,
+    of_present,
+    of_samples,
+    surveyed_together,
+)
 from emmc_rig.reconstruction.adaptive.uncertainty import within_db
 from emmc_rig.reconstruction.inputs import Readings
 from emmc_rig.reconstruction.result import WITHIN, Progress, Reconstruction, Status
@@ -94,6 +102,12 @@ def reconstruct_next(
     if shown := film.shown(whole.psi):
         return _reconstructed(whole, settings, on_step, film, shown=shown)
     given, edges = _without_edges(whole, settings)
+    if film.known is not None and edges is None:
+        rest = film.known.rest
+        changed = rest.changed(given)
+        places = windows(changed)
+        if covered(places) < WHOLE * changed.size:
+            return _resting(film, rest, given, changed, places, settings, on_step, started)
     total = film.settings.texture.steps + 1
 
     def report(step: int) -> None:
@@ -110,10 +124,68 @@ def reconstruct_next(
         return film
     report(total)
     if not found.slow:
-        seen = found.plain, found.scene_left, result.light_field, found.beliefs_left
-        rest = found.rest(known, result.light_field)
-        film = film.after(*seen, known.missed, found.earlier, rest)
+        seen = found.plain, found.fits.scene, result, beliefs
+        film = film.after(*seen, known.missed, found.earlier)
     return replace(result, parameters=result.parameters | found.parameters, film=film)
+
+
+def _resting(
+    film: Film,
+    rest: Rest,
+    given: Readings,
+    changed: NDArray[np.bool_],
+    places: Sequence[Window],
+    settings: AdaptiveSettings,
+    on_step: Callable[[Progress], None] | None,
+    started: float,
+) -> Reconstruction:
+    """Return the light field of a frame of a camera at rest: what rests, and what changed anew."""
+    psi, k = given.psi, given.psi.binning
+    settings = settings.model_copy(update={"contrast": CONTRAST * film.known.scale})
+    rest = rest.after(given, changed)
+    if rest.due():
+        whole = _reconstructed(rest.mean(given), settings, None)
+        rest = replace(
+            rest.with_fit(whole, tuple(slice(0, n) for n in rest.fits.shape), k),
+            whole=rest.whole + 1,
+        )
+        places = []
+    mean = rest.mean(given)
+    for rows, columns in places:
+        samples = tuple(slice(at.start * k, at.stop * k) for at in (rows, columns))
+        at = np.s_[:, rows, columns]
+        part = Readings(
+            psi.window(*samples),
+            *(
+                np.ascontiguousarray(each) if isinstance(each, np.ndarray) else each
+                for each in (mean.frames[at], mean.typical, mean.noise[at], mean.usable[at])
+            ),
+        )
+        before = Before(
+            rest.picture[samples],
+            rest.disparity[samples],
+            of_samples(changed[rows, columns], rest.disparity[samples]),
+        )
+        rest = rest.with_fit(
+            _reconstructed(part, settings, None, before=before), (rows, columns), k
+        )
+    light_field = mixture.values(rest.light_field)
+    residual = (given.frames - psi.forward(light_field)).astype(np.float32)
+    figures = dict(rest.figures)
+    figures |= misfit(residual, given.noise, given.usable)
+    figures |= {"still_share": float(1 - changed.mean())}
+    return Reconstruction(
+        method="adaptive",
+        light_field=light_field,
+        status=Status.CONVERGED,
+        advice="",
+        steps=1,
+        objective=(),
+        seconds=running_s() - started,
+        parameters=figures,
+        maps=rest.maps,
+        film=replace(film, known=replace(film.known, rest=rest)),
+    )
 
 
 def reconstruct_moving(
@@ -144,6 +216,7 @@ def _reconstructed(
     patches: Patches | None = None,
     shown: Sequence[tuple[Readings, Array]] = (),
     known: Array | None = None,
+    before: Before | None = None,
 ) -> Reconstruction:
     """Return the light field of a frame.
 
@@ -170,16 +243,21 @@ def _reconstructed(
     second = searched_again(together, settings) if known is None else None
     if second is not None:
         total = 2 * settings.texture.steps + 3
-    fits = fitted_models(survey, settings, lambda step: report(2 + step), patches, second, others)
+    was = None if before is None else before.carried(survey.picture)
+    fits = fitted_models(
+        survey, settings, lambda step: report(2 + step), patches, second, others, was
+    )
     beliefs, scene = survey.volume if second is None else second, fits.scene
     result = _result_of(survey, fits, survey.volume, beliefs, edges, whole, total, started)
     report(total)
+    if before is not None:
+        result = replace(result, maps=result.maps | {"picture": survey.picture})
     left = result.parameters["misfit"]
     of_others = moved(others) if others else {}
     return replace(
         result,
         parameters=result.parameters | {"search_seconds": searched_s} | of_others,
-        film=film and film.after(survey, scene, result.light_field, beliefs, left, others),
+        film=film and film.after(survey, scene, result, beliefs, left, others),
     )
 
 
@@ -213,8 +291,12 @@ def _result_of(
     disparity_sigma = np.sqrt(search.variance_per_pixel(believed, size, k))
     mean = averaged(survey, fits, disparity_sigma)
     residual = (given.frames - psi.forward(mean.light_field)).astype(np.float32)
+    centre = fits.scene.centre
+    if len(fits.centres) > 1:
+        shares = mean.shares[: len(fits.centres)].repeat(k, axis=1).repeat(k, axis=2)
+        centre = np.take_along_axis(np.stack(fits.centres), shares.argmax(axis=0)[None], 0)[0]
     maps = {
-        "disparity": fits.scene.centre,
+        "disparity": centre,
         "disparity_sigma": disparity_sigma,
         "texture": _texture_map(searched, size, k),
         **({} if mean.sigma is None else {"sigma": mean.sigma}),
