@@ -34,7 +34,6 @@ from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.patches import (
     PatchSensing,
     overlap_add,
-    pixel_of_sample,
     regular_grid,
     selected_atoms,
     sense_atoms,
@@ -97,7 +96,7 @@ class PatchEstimates:
 class _Batch:
     """Patches whose pixels see the same colours, in classes of equal Psi and usable pixels.
 
-    atoms: the different sets of atoms as shots see them, (atom, part, padded sample) each.
+    atoms: the different sets of atoms as shots see them, (pixel, ray, atom) each.
     set_of_shot: index of each shot's set. classes: indices of the patches of each class. sensing:
     of all patches, class by class.
     """
@@ -147,7 +146,6 @@ class _Coder:
         self.atoms = favoured(dictionary.atoms, settings.flat_favour)
         self.matrix = self.atoms.reshape(dictionary.size, -1)
         self.grid = regular_grid(psi.size, (rows, columns), settings.stride, psi.binning)
-        self.pixel = pixel_of_sample((rows, columns), psi.binning)
         self.pixels = rows * columns // psi.binning**2
         self.classes = 0
 
@@ -187,10 +185,16 @@ class _Coder:
         fitting = max(1, int(BATCH_BYTES // (4 * len(self.atoms) * (measurements + 8))))
         for colours, patches in self._colour_groups():
             if colours is None:
-                sets, set_of_shot = [selected_atoms(self.atoms, None)], [0] * self.psi.shots
+                sets, set_of_shot = (
+                    [selected_atoms(self.atoms, None, self.psi.binning)],
+                    [0] * self.psi.shots,
+                )
             else:
                 shots = list(_grouped(of_shot.tobytes() for of_shot in colours).values())
-                sets = [selected_atoms(self.atoms, colours[alike[0]]) for alike in shots]
+                sets = [
+                    selected_atoms(self.atoms, colours[alike[0]], self.psi.binning)
+                    for alike in shots
+                ]
                 set_of_shot = [
                     next(i for i, alike in enumerate(shots) if shot in alike)
                     for shot in range(self.psi.shots)
@@ -217,8 +221,7 @@ class _Coder:
         shape = len(batch.classes), len(self.atoms), sensing.data.shape[1]
         sensed = np.zeros(shape, dtype=np.float32)
         for shot, chosen in enumerate(batch.set_of_shot):
-            weights = np.ascontiguousarray(sensing.weights[firsts, shot])
-            sense_atoms(batch.atoms[chosen], weights, self.pixel, self.pixels, shot, sensed)
+            sense_atoms(batch.atoms[chosen], sensing.weights[shot][:, firsts], shot, sensed)
         estimates = np.zeros((ends[-1], self.matrix.shape[1]), dtype=np.float32)
         codes = []
         for atoms, first, end in zip(sensed, firsts, ends, strict=True):
