@@ -358,9 +358,8 @@ def surveyed(
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])
-    patch = (
-        usual_patch(psi.binning, psi.shots) if dictionary is None else dictionary.patch_shape[2:4]
-    )
+    own = usual_patch(psi.binning, psi.shots, psi.views)
+    patch = own if dictionary is None else dictionary.patch_shape[2:4]
     settled = _settled(sample.psi, sample.frames, settings, sparse, patch)
     return CaptureSurvey(settled, halo, left_out, gains, words, largest_px)
 

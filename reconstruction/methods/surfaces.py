@@ -32,12 +32,17 @@ PATCH_TV_RTOL = 1e-3
 3e-3 costs 0.01 dB, and antinous 0.1."""
 
 
+def patch_of(psi: ImagingMatrix) -> tuple[int, int]:
+    """Return rows and columns of the patches that `adaptive` averages with."""
+    return usual_patch(psi.binning, psi.shots, psi.views)
+
+
 def sparse_patches(settings: SparseSettings, psi: ImagingMatrix) -> SparseSettings:
     """Return the settings of the patches that `adaptive` averages with.
 
     Patches lie at most two thirds of their width apart, cut no pixel, and are less exact.
     """
-    binning, side = psi.binning, usual_patch(psi.binning, psi.shots)[0]
+    binning, side = psi.binning, patch_of(psi)[0]
     stride = max(min(settings.stride, -(-2 * side // 3)) // binning * binning, binning)
     exact = {"rtol": PATCH_RTOL, "max_steps": PATCH_STEPS}
     solver = settings.solver.model_copy(update=exact)
@@ -78,7 +83,7 @@ def _solve(
 
     def patches(usable: NDArray[np.bool_], disparity: Array) -> NDArray[np.float32]:
         """Return the light field of `tv-dict`, less exact, from some of the readings."""
-        shape = psi.light_field_shape[:2], usual_patch(psi.binning, present.psi.shots)
+        shape = psi.light_field_shape[:2], patch_of(present.psi)
         atoms = _dictionary(*shape, planes_of_scene(*shape, disparity))
         frames = dataclasses.replace(present.frames, usable=usable)
         fitted = dataclasses.replace(present, frames=frames, dictionary=atoms, on_step=None)

@@ -129,7 +129,10 @@ def test_blocks_and_time_budgets_ask_the_method_and_name_none():
 @pytest.mark.parametrize("binning", range(1, 18))
 def test_the_patches_of_adaptive_cut_no_pixel_and_leave_no_gap(random_psi, binning, shots):
     size = (10 * binning, 10 * binning)
-    psi, patch = random_psi(shots, (1, 1), size, binning=binning), usual_patch(binning, shots)
+    psi, patch = (
+        random_psi(shots, (1, 1), size, binning=binning),
+        usual_patch(binning, shots, (1, 1)),
+    )
     stride = sparse_patches(SparseSettings(), psi).stride
     assert len(regular_grid(size, patch, stride, binning)) > 1
 
