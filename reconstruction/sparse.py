@@ -23,6 +23,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -236,6 +237,7 @@ class _Coder:
         return _CodedBatch(batch.patches, estimates, sensing.measured, codes)
 
 
+@one_blas_thread()
 def estimate_patches(
     psi: ImagingMatrix,
     frames: Frames,

@@ -72,8 +72,8 @@ class TablesSettings(Settings):
 
 
 FAST = TablesSettings(
-    size=(96, 128),
-    binned_size=(64, 80),
+    size=(64, 80),
+    binned_size=(48, 64),
     methods=MethodSettings(
         tv=TVSettings(max_steps=100),
         sparse=SparseSettings(solver=BPDNSettings(method="admm", rtol=1e-2, max_steps=200)),
