@@ -42,8 +42,8 @@ BY_PARALLAX = "@by-parallax"
 class Scene:
     """A light field (v, u, y, x, 3) with its origin, and its disparity if known.
 
-    `disparity_px` is (y, x), pixels per view step, of the centre view. Measured scenes have none, nor
-    have the truths of simulated captures.
+    `disparity_px` is (y, x), pixels per view step, of the centre view. Measured scenes have none,
+    nor have the truths of simulated captures.
     NumPy takes a scene as its light field: `psi @ scene`.
     """
 
