@@ -72,8 +72,8 @@ class TablesSettings(Settings):
 
 
 FAST = TablesSettings(
-    size=(64, 80),
-    binned_size=(48, 64),
+    size=(48, 48),
+    binned_size=(32, 40),
     methods=MethodSettings(
         tv=TVSettings(max_steps=100),
         sparse=SparseSettings(solver=BPDNSettings(method="admm", rtol=1e-2, max_steps=200)),
@@ -220,7 +220,9 @@ class TablesStudy(Study[Cell]):
         for binning in {cell.setup.binning for cell in self.cells}:
             self.dictionary(binning)
         for cell in {cell.scene: cell for cell in self.cells}.values():
-            rows, columns = self.capture(cell).scene_seen().size
+            capture = self.capture(cell)
+            rows, columns = capture.scene_seen().size
+            capture.identity()  # sums the scene while it is in memory: few scenes are
             if min(rows, columns) < SMALLEST_PX:
                 raise AppError(
                     f"{cell.scene}: {rows}x{columns} pixels, needs {SMALLEST_PX}x{SMALLEST_PX} or "
