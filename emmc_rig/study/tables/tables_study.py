@@ -73,13 +73,13 @@ class TablesSettings(Settings):
 
 FAST = TablesSettings(
     size=(48, 48),
-    binned_size=(32, 40),
+    binned_size=(32, 32),
     methods=MethodSettings(
         tv=TVSettings(max_steps=100),
         sparse=SparseSettings(solver=BPDNSettings(method="admm", rtol=1e-2, max_steps=200)),
     ),
 )
-"""Crops: all tables on nine scenes in minutes."""
+"""Crops: all tables on thirteen scenes in three minutes on two cores."""
 
 
 def scene_specs(folder: Path | None) -> dict[str, str]:
@@ -174,12 +174,16 @@ class TablesStudy(Study[Cell]):
     journal = "cells.jsonl"
     noun = "cells"
     stage = "reconstruct"
-    revision = 2
+    revision = 3
     command, title, page = "tables", "The paper's tables, reproduced", "tables.html"
     caveats = (
         "The paper's figures are for orientation: its aperture variant of the MIT scenes and its "
         "distance from mask to sensor are unknown. Compare methods and scenarios within one run.",
         "The paper's means are over all of its scenes, whether they are measured here or not.",
+        "In the paper three monochrome shots lead three CFA shots, here they trail them. Noise-free "
+        "columns depend on neither light nor the unit of noise, and masks are the paper's. The "
+        "dictionaries differ: the paper does not state its penalty, and learned its atoms from "
+        "scenes of the same archive.",
     )
     columns: ClassVar[Mapping[str, Sequence[str]]] = {
         CSV: (
