@@ -180,10 +180,10 @@ class TablesStudy(Study[Cell]):
         "The paper's figures are for orientation: its aperture variant of the MIT scenes and its "
         "distance from mask to sensor are unknown. Compare methods and scenarios within one run.",
         "The paper's means are over all of its scenes, whether they are measured here or not.",
-        "In the paper three monochrome shots lead three CFA shots, here they trail them. Noise-free "
-        "columns depend on neither light nor the unit of noise, and masks are the paper's. The "
-        "dictionaries differ: the paper does not state its penalty, and learned its atoms from "
-        "scenes of the same archive.",
+        "In the paper three monochrome shots lead three CFA shots; here they trail them. Columns "
+        "without noise depend on neither light nor the unit of noise, and the mask is the paper's. "
+        "The dictionary differs: the paper's was learned from scenes of the same archive, and its "
+        "penalty is not stated.",
     )
     columns: ClassVar[Mapping[str, Sequence[str]]] = {
         CSV: (
