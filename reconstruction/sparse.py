@@ -23,6 +23,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -44,6 +45,8 @@ from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
 Array = NDArray[np.floating]
 FLAT = 1e-3
 """Spread of each colour in an atom, over its largest value, below which the atom is flat."""
+SOME = 100
+"""Of so many samples the first alone rules out most atoms that are not flat."""
 BATCH_BYTES = 48 * 2**20
 """Size of the sensed dictionaries that a thread holds at a time."""
 
@@ -67,11 +70,17 @@ def favoured(atoms: NDArray[np.float32], favour: float) -> NDArray[np.float32]:
     mean colour; to penalise it as if it were rare draws all patches towards grey and black, most
     where the frames separate colours weakly (monochrome sensors).
     """
-    spread = np.ptp(atoms.reshape(len(atoms), -1, atoms.shape[-1]), axis=1).max(axis=1)
-    flat = spread < FLAT * np.abs(atoms).max(axis=(1, 2, 3, 4, 5))
-    if favour == 1 or not flat.any():
+    if favour == 1:
         return atoms
-    return atoms * np.where(flat, np.float32(favour), np.float32(1)).reshape(-1, 1, 1, 1, 1, 1)
+    samples = atoms.reshape(len(atoms), -1, atoms.shape[-1])
+    largest = np.float32(FLAT) * np.abs(samples).max(axis=(1, 2))
+    flat = np.flatnonzero(np.ptp(samples[:, ::SOME], axis=1).max(axis=1) < largest)
+    flat = flat[np.ptp(samples[flat], axis=1).max(axis=1) < largest[flat]]
+    if not len(flat):
+        return atoms
+    scaled = atoms.copy()
+    scaled[flat] *= np.float32(favour)
+    return scaled
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +248,7 @@ class _Coder:
         return _CodedBatch(batch.patches, estimates, sensing.measured, codes)
 
 
+@one_blas_thread()
 def estimate_patches(
     psi: ImagingMatrix,
     frames: Frames,

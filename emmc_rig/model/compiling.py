@@ -34,7 +34,10 @@ import llvmlite
 import numba
 from filelock import FileLock
 from numba.core import config
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, Flags
 from numba.core.registry import CPUDispatcher
+from numba.core.targetconfig import TargetConfig
 
 _PROJECT = Path(__file__).parents[2]
 _IMPORT = re.compile(r"^from +([\w.]+) +import +(\([^)]*\)|.*)|^import +([\w.]+)", re.MULTILINE)
@@ -47,6 +50,51 @@ _numba: Any = config
 _placing = threading.Lock()
 _within = threading.local()
 """Set in a thread that compiles or loads a kernel."""
+
+
+def _same_flags(self: Flags, other: Any) -> bool:
+    """Return whether all options are equal; at once where the same are set to the same values."""
+    if type(self) is type(other) and getattr(self, "_values", 0) == getattr(other, "_values", 1):
+        return True
+    return TargetConfig.__eq__(self, other)
+
+
+_FLAGS_HASH = hash(Flags())
+"""Numba's hash of flags is the hash of their names."""
+# Numba compares flags at each call that it types, option by option: a quarter of all compiling.
+setattr(Flags, "__eq__", _same_flags)  # noqa: B010
+setattr(Flags, "__hash__", lambda _: _FLAGS_HASH)  # noqa: B010
+
+
+class _HelperCode(JITCodeLibrary):
+    """A helper's code, which LLVM optimises and turns into machine code within the kernel alone."""
+
+    def _optimize_final_module(self) -> None:
+        """Nothing: the kernel's module is optimised after all helpers are linked into it."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return that there is no machine code."""
+        return 0
+
+    @property
+    def codegen(self) -> Any:
+        """What Numba gives the machine code its environment by: nothing, as there is none."""
+        return self
+
+    def set_env(self, env_name: str, env: Any) -> None:
+        """Nothing: a kernel that was loaded from the disk has no environment of helpers either."""
+
+
+class _HelperCompiler(Compiler):
+    """Numba's compiler, whose result is `_HelperCode`."""
+
+    def __init__(self, typingctx: Any, targetctx: Any, library: Any, *others: Any) -> None:
+        library = _HelperCode(targetctx.codegen(), "helper")
+        super().__init__(typingctx, targetctx, library, *others)
 
 
 class _Inlined(CPUDispatcher):
@@ -69,6 +117,7 @@ def njit(*arguments: Any, cache: bool = False, **options: Any) -> Callable[..., 
     is_helper = options.get("forceinline") or options.get("inline") == "always"
     if is_helper:
         options["no_cpython_wrapper"] = True
+        options["pipeline_class"] = _HelperCompiler
 
     def compiled(kernel: Callable) -> Callable[..., Any]:
         if is_helper:
