@@ -34,8 +34,7 @@ import llvmlite
 import numba
 from filelock import FileLock
 from numba.core import config
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, Flags
+from numba.core.compiler import Flags
 from numba.core.registry import CPUDispatcher
 from numba.core.targetconfig import TargetConfig
 
@@ -66,37 +65,6 @@ setattr(Flags, "__eq__", _same_flags)  # noqa: B010
 setattr(Flags, "__hash__", lambda _: _FLAGS_HASH)  # noqa: B010
 
 
-class _HelperCode(JITCodeLibrary):
-    """A helper's code, which LLVM optimises and turns into machine code within the kernel alone."""
-
-    def _optimize_final_module(self) -> None:
-        """Nothing: the kernel's module is optimised after all helpers are linked into it."""
-
-    def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
-        self._finalized = True
-
-    def get_pointer_to_function(self, name: str) -> int:
-        """Return that there is no machine code."""
-        return 0
-
-    @property
-    def codegen(self) -> Any:
-        """What Numba gives the machine code its environment by: nothing, as there is none."""
-        return self
-
-    def set_env(self, env_name: str, env: Any) -> None:
-        """Nothing: a kernel that was loaded from the disk has no environment of helpers either."""
-
-
-class _HelperCompiler(Compiler):
-    """Numba's compiler, whose result is `_HelperCode`."""
-
-    def __init__(self, typingctx: Any, targetctx: Any, library: Any, *others: Any) -> None:
-        library = _HelperCode(targetctx.codegen(), "helper")
-        super().__init__(typingctx, targetctx, library, *others)
-
-
 class _Inlined(CPUDispatcher):
     """What is compiled into kernels alone: machine code that Python could call is not made."""
 
@@ -117,7 +85,6 @@ def njit(*arguments: Any, cache: bool = False, **options: Any) -> Callable[..., 
     is_helper = options.get("forceinline") or options.get("inline") == "always"
     if is_helper:
         options["no_cpython_wrapper"] = True
-        options["pipeline_class"] = _HelperCompiler
 
     def compiled(kernel: Callable) -> Callable[..., Any]:
         if is_helper:

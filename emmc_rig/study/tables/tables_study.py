@@ -182,7 +182,7 @@ class TablesStudy(Study[Cell]):
         "The paper's means are over all of its scenes, whether they are measured here or not.",
         "In the paper three monochrome shots lead three CFA shots; here they trail them. Columns "
         "without noise depend on neither light nor the unit of noise, and the mask is the paper's. "
-        "The dictionary differs: the paper's was learned from scenes of the same archive, and its "
+        "The dictionary differs: the paper's was trained, ours needs no training, and the paper's "
         "penalty is not stated.",
     )
     columns: ClassVar[Mapping[str, Sequence[str]]] = {
