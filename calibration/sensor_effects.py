@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from emmc_rig.calibration.sensor_levels import (
     BLOCKS,
@@ -44,7 +44,7 @@ class Effect:
         """Whether noise alone is less likely than CHANCE to be as large."""
         if self.freedom < 1 or self.deviation <= 0:
             return False
-        return bool(2 * student.sf(abs(self.size) / self.deviation, self.freedom) < CHANCE)
+        return bool(2 * stdtr(self.freedom, -abs(self.size) / self.deviation) < CHANCE)
 
     @property
     def correction(self) -> float:

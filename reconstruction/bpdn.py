@@ -25,6 +25,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.linalg import get_lapack_funcs
 
 from emmc_rig.model.settings import Settings
 from emmc_rig.reconstruction import bpdn_kernels as kernels
@@ -42,6 +43,8 @@ LARS_GAP = 0.05
 """A path that ends further from the minimiser went wrong by rounding: status not converged."""
 FIRST_STEPS = 20
 """Steps of ADMM on all atoms, which determine the working set."""
+WHOLE = 8
+"""Atoms per measurement up to which ADMM needs no working set."""
 INNER_SHARE = 0.5
 """Share of the tolerance to which ADMM solves a working set."""
 DEPENDENT = 1e-3
@@ -58,6 +61,9 @@ FRESH = 0.7
 """LARS: when the level has fallen to this share, correlations are computed anew (32-bit sums)."""
 DARKEST = 1e-6
 """Norm of a sensed atom over the largest, below which it is dark and never chosen."""
+
+
+_CHOLESKY, _INVERSE_OF_FACTOR = get_lapack_funcs(("potrf", "potri"), dtype=np.float64)
 
 
 class BPDNSettings(Settings):
@@ -194,10 +200,13 @@ def ridge_inverse(atoms: Array32, ridge: float) -> Array32:
     exact = atoms if count >= length else atoms.astype(np.float64)
     gram = (exact.T @ exact).astype(np.float64)
     gram[np.diag_indices(length)] += ridge
-    try:
-        return np.linalg.inv(gram).astype(np.float32)
-    except np.linalg.LinAlgError as fault:
-        raise ReconstructionError("a sensed dictionary is singular: raise the penalty") from fault
+    # By Cholesky factors: two thirds of the operations of a general inverse.
+    factor, singular = _CHOLESKY(gram.T, lower=1, clean=0)
+    if singular:
+        raise ReconstructionError("a sensed dictionary is singular: raise the penalty")
+    lower = np.tril(_INVERSE_OF_FACTOR(factor, lower=1, overwrite_c=1)[0]).astype(np.float32)
+    lower[np.diag_indices(length)] /= 2
+    return lower + lower.T
 
 
 class _Solver(ABC):
@@ -288,7 +297,8 @@ class _Admm(_Minimiser):
         self.inner = INNER_SHARE * self.settings.rtol
         self.w = np.zeros(len(self.atoms), np.float32)
         self.dual_point = np.empty(len(self.data), np.float32)
-        first = min(self.settings.max_steps, FIRST_STEPS)
+        few = len(self.atoms) <= WHOLE * len(self.data)
+        first = self.settings.max_steps if few else min(self.settings.max_steps, FIRST_STEPS)
         run = self._split(self.atoms, self.sensed.inverse, self.settings.rtol, first, self.w)
         self.steps, self.gap = float(run.steps), run.gap
         self.working = _largest(np.abs(self.w), 2 * len(self.data))

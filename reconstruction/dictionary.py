@@ -235,10 +235,26 @@ def lambertian_dictionary(
     return Dictionary.normalised(atoms, "lambertian")
 
 
-def usual_patch(binning: int) -> tuple[int, int]:
-    """Return rows and columns of a patch: 9 samples, or the nearest multiple of k below."""
-    side = 9 // binning * binning or binning
-    return side, side
+RARE = 0.01
+"""Share of the lowest, and of the highest disparities of a scene that need no plane."""
+MOST_READINGS = 243
+"""Of a patch with several shots: the cost of a patch grows with their cube. In the mean of
+`adaptive`, group A, 96x96, two and three shots, patches of 6 samples 4 apart gain 0.07 dB over 9
+samples 5 apart and take a quarter of the time (dice -0.1 dB, buttercup +0.5); 5 samples 4 apart
+lose 0.05 dB."""
+
+
+def usual_patch(binning: int, shots: int = 1, views: tuple[int, int] = (5, 5)) -> tuple[int, int]:
+    """Return rows and columns of a patch: 9 samples, or the nearest multiple of k below.
+
+    With several shots 6 pixels, or more for the disparities that 5x5 views of 6 pixels show (with
+    8x8 views, three shots, 9 pixels gain 0.4 dB over 6), or as few as 4 for MOST_READINGS.
+    """
+    pixels = 9 // binning or 1
+    if shots > 1:
+        wanted = max(6, 3 * _reach(views))
+        pixels = min(pixels, max(4, min(wanted, int((MOST_READINGS / shots) ** 0.5))))
+    return pixels * binning, pixels * binning
 
 
 def plane_disparities(views: tuple[int, int], patch: tuple[int, int]) -> tuple[float, ...]:
@@ -250,6 +266,20 @@ def plane_disparities(views: tuple[int, int], patch: tuple[int, int]) -> tuple[f
     step = 1 / _reach(views)
     last = int(min(2 / step, max(patch) / 2))
     return tuple(step * i for i in range(-last, last + 1))
+
+
+def planes_of_scene(
+    views: tuple[int, int], patch: tuple[int, int], disparity: NDArray[np.floating]
+) -> tuple[float, ...]:
+    """Return those of `plane_disparities` that a scene needs: to a step beyond all but its rarest.
+
+    disparity: of the scene, of any shape. With three shots (96x96, groups A and B) the others gain
+    0.00 to 0.02 dB, and cost up to half of the time.
+    """
+    planes = np.array(plane_disparities(views, patch))
+    low, high = np.clip(np.quantile(disparity, (RARE, 1 - RARE)), planes[0], planes[-1])
+    step = 1 / _reach(views)
+    return tuple(float(plane) for plane in planes if low - step < plane < high + step)
 
 
 def _reach(views: tuple[int, int]) -> int:

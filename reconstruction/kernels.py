@@ -249,7 +249,9 @@ def _sweep_band(data, steps, stencils, light_field, dual, ahead, band, last_rows
     One place calls the dual step: compiled at two, it might round differently at each.
     """
     back = steps.metric.T.copy()
-    furthest = stencils.reach[:, 1].max()
+    furthest = 0
+    for index in range(len(stencils.reach)):
+        furthest = max(furthest, stencils.reach[index, 1])
     flat = ahead.reshape((*ahead.shape[:3], ahead.shape[3] * ahead.shape[4]))
     begin, end = band
     done = begin * data.binning

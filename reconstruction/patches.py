@@ -70,14 +70,26 @@ def padded(length: int) -> int:
 class PatchSensing:
     """What Psi and the frames say in some patches.
 
-    weights: (patch, shot, part, padded sample), the coefficients of Psi, a part being a view, or
-        a colour of a view where pixels see three colours. Zero where a pixel is not usable.
+    weights: (shot, pixel, patch, ray), the coefficients of Psi; the rays of a pixel are the samples
+        of its parts, a part being a view, or a colour of a view where pixels see three colours.
+        Zero where a pixel is not usable.
     data: (patch, padded measurement), 0 where not usable. measured: usable pixels of each patch.
     """
 
     weights: NDArray[np.float32]
     data: NDArray[np.float32]
     measured: NDArray[np.int64]
+
+
+def _by_pixel(
+    values: NDArray[np.float32], shape: tuple[int, int], binning: int
+) -> NDArray[np.float32]:
+    """Return values (..., part, sample) of a patch by pixels and their rays, (..., pixel, ray)."""
+    *before, parts, _ = values.shape
+    rows, columns, k = shape[0] // binning, shape[1] // binning, binning
+    cut = values.reshape(*before, parts, rows, k, columns, k)
+    pixels_first = np.moveaxis(cut, (-4, -2), (len(before), len(before) + 1))
+    return pixels_first.reshape(*before, rows * columns, parts * k * k)
 
 
 def sense_patches(
@@ -93,7 +105,7 @@ def sense_patches(
     pixels = samples // k**2
     parts = views_v * views_u * stored
     count = len(corners)
-    weights = np.zeros((count, shots, parts, padded(samples)), dtype=np.float32)
+    weights = np.empty((shots, pixels, count, parts * k**2), dtype=np.float32)
     data = np.zeros((count, padded(shots * pixels)), dtype=np.float32)
     measured = np.empty(count, dtype=np.int64)
     for i, (y, x) in enumerate(corners):
@@ -101,24 +113,17 @@ def sense_patches(
         seen = slice(y // k, (y + shape[0]) // k), slice(x // k, (x + shape[1]) // k)
         kept = frames.usable[:, seen[0], seen[1]]
         cut = psi.weights[:, :, :, rows, :, columns].transpose(0, 1, 2, 4, 3, 5)
-        if not kept.all():
-            cut = cut * kept.repeat(k, axis=1).repeat(k, axis=2)[:, None, None, None]
-        weights[i, :, :, :samples] = cut.reshape(shots, parts, samples)
+        rays = _by_pixel(cut.reshape(shots, parts, samples), shape, k)
+        weights[:, :, i] = rays * kept.reshape(shots, pixels, 1)
         data[i, : shots * pixels] = np.where(kept, frames.readings[:, seen[0], seen[1]], 0).ravel()
         measured[i] = kept.sum()
     return PatchSensing(weights, data, measured)
 
 
-def pixel_of_sample(shape: tuple[int, int], binning: int) -> NDArray[np.int64]:
-    """Return the index of the pixel within its patch that each sample reaches: (sample,)."""
-    y, x = np.indices(shape) // binning
-    return (y * (shape[1] // binning) + x).ravel().astype(np.int64)
-
-
 def selected_atoms(
-    atoms: NDArray[np.float32], colours: NDArray[np.uint8] | None
+    atoms: NDArray[np.float32], colours: NDArray[np.uint8] | None, binning: int
 ) -> NDArray[np.float32]:
-    """Return the atoms as a pixel of known colour sees them: (atom, part, padded sample).
+    """Return the atoms as pixels of known colour see them: (pixel, ray, atom).
 
     atoms: (atom, v, u, y, x, c). colours: (sample,), or None: all three, as parts.
     """
@@ -126,57 +131,29 @@ def selected_atoms(
     views, samples = views_v * views_u, rows * columns
     flat = atoms.reshape(count, views, samples, 3)
     if colours is None:
-        out = np.zeros((count, views, 3, padded(samples)), dtype=np.float32)
-        out[..., :samples] = flat.transpose(0, 1, 3, 2)
-        return out.reshape(count, views * 3, -1)
-    out = np.zeros((count, views, padded(samples)), dtype=np.float32)
-    for colour in range(3):
-        here = np.flatnonzero(colours == colour)
-        out[:, :, here] = flat[:, :, here, colour]
-    return out
+        parts = flat.transpose(0, 1, 3, 2).reshape(count, views * 3, samples)
+    else:
+        parts = flat[:, :, np.arange(samples), colours]
+    rays = _by_pixel(parts, (rows, columns), binning)
+    return np.ascontiguousarray(rays.transpose(1, 2, 0))
 
 
-@njit(cache=True, fastmath=True, nogil=True)
-def sense_atoms(selected, weights, pixel, pixels, shot, out):
-    """Add one shot's rows to out (patch, atom, padded measurement), the sensed dictionaries.
+def sense_atoms(
+    selected: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    shot: int,
+    out: NDArray[np.float32],
+) -> None:
+    """Set one shot's rows of out (patch, atom, padded measurement), the sensed dictionaries.
 
-        row[i]                          = sum over parts of atom[part, i] weights[part, i]
-        out[p, j, pixels shot + pixel[i]] = sum of row over the samples i of that pixel
-    selected: (atom, part, padded sample). weights: (patch, part, padded sample).
-    pixel: (sample,), see `pixel_of_sample`; `pixels` of them a shot.
-    Operations: 2 patches atoms parts samples. Each atom is read once for all patches. Five parts at
-    a time: fewer passes over the row.
+        out[p, j, pixels shot + i] = sum over rays of atom[i, ray, j] weights[i, p, ray]
+
+    selected: (pixel, ray, atom). weights: (pixel, patch, ray). Operations: 2 pixels patches atoms
+    rays.
     """
-    count, parts, width = selected.shape
-    first = shot * pixels
-    samples = pixel.size
-    row = np.empty(width, np.float32)
-    whole = parts - parts % 5
-    for j in range(count):
-        atom = selected[j]
-        for p in range(weights.shape[0]):
-            seen = weights[p]
-            for i in range(width):
-                row[i] = 0
-            for v in range(0, whole, 5):
-                a, b, c, d, e = atom[v], atom[v + 1], atom[v + 2], atom[v + 3], atom[v + 4]
-                f, g, h = seen[v], seen[v + 1], seen[v + 2]
-                k, m = seen[v + 3], seen[v + 4]
-                for i in range(width):
-                    row[i] += a[i] * f[i] + b[i] * g[i] + c[i] * h[i] + d[i] * k[i] + e[i] * m[i]
-            for v in range(whole, parts):
-                a, f = atom[v], seen[v]
-                for i in range(width):
-                    row[i] += a[i] * f[i]
-            line = out[p, j]
-            if pixels == samples:
-                for i in range(samples):
-                    line[first + i] = row[i]
-            else:
-                for i in range(pixels):
-                    line[first + i] = 0
-                for i in range(samples):
-                    line[first + pixel[i]] += row[i]
+    pixels = len(selected)
+    rows = np.matmul(weights, selected)
+    out[..., shot * pixels : (shot + 1) * pixels] = rows.transpose(1, 2, 0)
 
 
 @njit(cache=True, fastmath=True, nogil=True)

@@ -29,6 +29,8 @@ the shots are two. Masks that are blurred or displaced show weaker than in Psi, 
 shot not at all."""
 LEAST_FLICKER, SURE = 0.003, 4.0
 """The least flicker evened, and by how many standard errors it must exceed none."""
+LEAST_COLOUR = 0.05
+"""Share of a shot's brightest colour; a shot sees no colour of which it gets less."""
 GAIN_STEPS = 4
 """Rounds in which the shots' brightness and the picture that explains them are found in turn."""
 WELL_LIT, FEWEST_LIT = 0.2, 100
@@ -170,9 +172,10 @@ def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -
 
 
 def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
-    """Return the brightness of the light in every shot, all 1 where none is sure.
+    """Return the brightness of the light in every shot, 1 where none is sure.
 
-    The light of most shots counts as 1 (the median), of two their mean.
+    Shots are compared if they see the same colours: behind a red and a blue filter the scene, too,
+    is unequally bright. The light of most shots counts as 1 (the median), of two their mean.
 
     What a pixel reads over what a smooth picture predicts is, but for the light, much the same in
     every shot: the scene's texture is in all of them. The median over the pixels is the light. In
@@ -181,6 +184,17 @@ def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
         gain_s   = gain_s median_i(ratio_si), over the mean gain
     where the prediction explains the evened readings.
     """
+    light = psi.picture_weights.mean(axis=(1, 2))
+    colours = light > LEAST_COLOUR * light.max(axis=1, keepdims=True)
+    gains = np.ones(len(frames))
+    for seen in np.unique(colours, axis=0):
+        alike = (colours == seen).all(axis=1)
+        gains[alike] = _gains_of(psi, frames, usable & alike[:, None, None])[alike]
+    return gains
+
+
+def _gains_of(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+    """Return the brightness of the light in the shots that are usable, of the same colours."""
     even = np.ones(len(frames))
     kept = np.flatnonzero(usable.any(axis=(1, 2)))
     if len(kept) < 2:

@@ -23,6 +23,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from pydantic import Field
 
+from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.sensing import ImagingMatrix
@@ -34,7 +35,6 @@ from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.patches import (
     PatchSensing,
     overlap_add,
-    pixel_of_sample,
     regular_grid,
     selected_atoms,
     sense_atoms,
@@ -45,6 +45,8 @@ from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
 Array = NDArray[np.floating]
 FLAT = 1e-3
 """Spread of each colour in an atom, over its largest value, below which the atom is flat."""
+SOME = 100
+"""Of so many samples the first alone rules out most atoms that are not flat."""
 BATCH_BYTES = 48 * 2**20
 """Size of the sensed dictionaries that a thread holds at a time."""
 
@@ -68,11 +70,17 @@ def favoured(atoms: NDArray[np.float32], favour: float) -> NDArray[np.float32]:
     mean colour; to penalise it as if it were rare draws all patches towards grey and black, most
     where the frames separate colours weakly (monochrome sensors).
     """
-    spread = np.ptp(atoms.reshape(len(atoms), -1, atoms.shape[-1]), axis=1).max(axis=1)
-    flat = spread < FLAT * np.abs(atoms).max(axis=(1, 2, 3, 4, 5))
-    if favour == 1 or not flat.any():
+    if favour == 1:
         return atoms
-    return atoms * np.where(flat, np.float32(favour), np.float32(1)).reshape(-1, 1, 1, 1, 1, 1)
+    samples = atoms.reshape(len(atoms), -1, atoms.shape[-1])
+    largest = np.float32(FLAT) * np.abs(samples).max(axis=(1, 2))
+    flat = np.flatnonzero(np.ptp(samples[:, ::SOME], axis=1).max(axis=1) < largest)
+    flat = flat[np.ptp(samples[flat], axis=1).max(axis=1) < largest[flat]]
+    if not len(flat):
+        return atoms
+    scaled = atoms.copy()
+    scaled[flat] *= np.float32(favour)
+    return scaled
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +105,7 @@ class PatchEstimates:
 class _Batch:
     """Patches whose pixels see the same colours, in classes of equal Psi and usable pixels.
 
-    atoms: the different sets of atoms as shots see them, (atom, part, padded sample) each.
+    atoms: the different sets of atoms as shots see them, (pixel, ray, atom) each.
     set_of_shot: index of each shot's set. classes: indices of the patches of each class. sensing:
     of all patches, class by class.
     """
@@ -147,7 +155,6 @@ class _Coder:
         self.atoms = favoured(dictionary.atoms, settings.flat_favour)
         self.matrix = self.atoms.reshape(dictionary.size, -1)
         self.grid = regular_grid(psi.size, (rows, columns), settings.stride, psi.binning)
-        self.pixel = pixel_of_sample((rows, columns), psi.binning)
         self.pixels = rows * columns // psi.binning**2
         self.classes = 0
 
@@ -187,10 +194,16 @@ class _Coder:
         fitting = max(1, int(BATCH_BYTES // (4 * len(self.atoms) * (measurements + 8))))
         for colours, patches in self._colour_groups():
             if colours is None:
-                sets, set_of_shot = [selected_atoms(self.atoms, None)], [0] * self.psi.shots
+                sets, set_of_shot = (
+                    [selected_atoms(self.atoms, None, self.psi.binning)],
+                    [0] * self.psi.shots,
+                )
             else:
                 shots = list(_grouped(of_shot.tobytes() for of_shot in colours).values())
-                sets = [selected_atoms(self.atoms, colours[alike[0]]) for alike in shots]
+                sets = [
+                    selected_atoms(self.atoms, colours[alike[0]], self.psi.binning)
+                    for alike in shots
+                ]
                 set_of_shot = [
                     next(i for i, alike in enumerate(shots) if shot in alike)
                     for shot in range(self.psi.shots)
@@ -217,8 +230,7 @@ class _Coder:
         shape = len(batch.classes), len(self.atoms), sensing.data.shape[1]
         sensed = np.zeros(shape, dtype=np.float32)
         for shot, chosen in enumerate(batch.set_of_shot):
-            weights = np.ascontiguousarray(sensing.weights[firsts, shot])
-            sense_atoms(batch.atoms[chosen], weights, self.pixel, self.pixels, shot, sensed)
+            sense_atoms(batch.atoms[chosen], sensing.weights[shot][:, firsts], shot, sensed)
         estimates = np.zeros((ends[-1], self.matrix.shape[1]), dtype=np.float32)
         codes = []
         for atoms, first, end in zip(sensed, firsts, ends, strict=True):
@@ -236,6 +248,7 @@ class _Coder:
         return _CodedBatch(batch.patches, estimates, sensing.measured, codes)
 
 
+@one_blas_thread()
 def estimate_patches(
     psi: ImagingMatrix,
     frames: Frames,

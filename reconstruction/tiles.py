@@ -25,7 +25,7 @@ from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.reconstruction.adaptive.settings import SIDES, Side
 from emmc_rig.reconstruction.adaptive.survey import contrast_of
-from emmc_rig.reconstruction.dictionary import Dictionary
+from emmc_rig.reconstruction.dictionary import Dictionary, usual_patch
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import check_frames
 from emmc_rig.reconstruction.method import BlockSettings
@@ -358,7 +358,9 @@ def surveyed(
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])
-    settled = _settled(sample.psi, sample.frames, settings, sparse)
+    own = usual_patch(psi.binning, psi.shots, psi.views)
+    patch = own if dictionary is None else dictionary.patch_shape[2:4]
+    settled = _settled(sample.psi, sample.frames, settings, sparse, patch)
     return CaptureSurvey(settled, halo, left_out, gains, words, largest_px)
 
 
@@ -367,16 +369,18 @@ def _settled(
     frames: Frames,
     settings: MethodSettings,
     sparse: SparseSettings | None,
+    patch: tuple[int, int],
 ) -> MethodSettings:
     """Return the settings with a block's own choices made once for all blocks.
 
-    sparse: settings of the patches, of methods that draw total variation towards some.
+    sparse: settings of the patches, of methods that draw total variation towards some. patch: their
+    rows and columns, in samples.
     """
     readings, noise_sigma, tv = frames.readings[frames.usable], frames.noise_sigma, settings.tv
     if not readings.size:
         return settings
     if sparse is not None:
-        tv = patched_weights(tv, sparse, psi, readings, noise_sigma)
+        tv = patched_weights(tv, sparse, patch, psi, readings, noise_sigma)
     mu = tv.mu or choose_mu(psi, readings, noise_sigma, tv.order)
     guess = smooth_guess(psi, frames.readings, frames.usable)
     step = tv.primal_step or choose_primal_step(contrast(guess), mu, tv.chroma_weight, tv.order)

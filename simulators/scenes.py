@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -36,15 +36,23 @@ _SMALLEST_PX = 16
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """A light field (v, u, y, x, 3) and what is known of it.
-
-    `disparity_px` (y, x), in pixels per view step, is of the first surface seen in the centre
-    view (V // 2, U // 2): a reflecting or transparent ball counts as a surface, a card where it
-    is at least half opaque.
-    """
+    """A light field (v, u, y, x, 3), and the tables of the world that it shows."""
 
     light_field: np.ndarray
-    disparity_px: np.ndarray
+    tables: Tables
+
+    @cached_property
+    def disparity_px(self) -> np.ndarray:
+        """Disparity (y, x), in pixels per view step, of the centre view (V // 2, U // 2).
+
+        It is that of the first surface seen: a reflecting or transparent ball counts as a surface,
+        a card where it is at least half opaque.
+        """
+        views, size = self.light_field.shape[:2], self.light_field.shape[2:4]
+        steps = max(views)
+        a_t, a_s = ((n // 2 - (n - 1) / 2) / steps for n in views)
+        d, _ = surfaces(pixel_centres(size), a_s, a_t, self.tables)
+        return (d * (size[1] / steps)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -75,7 +83,7 @@ def render(
         time_s: when a scene that moves is seen, without motion blur.
 
     Returns:
-        light_field (v, u, y, x, 3) float32 in [0, 1]; disparity_px (y, x) float32.
+        light_field (v, u, y, x, 3) float32 in [0, 1].
 
     Raises:
         SceneError: unknown name, a size or number of views too small, or a negative seed.
@@ -104,7 +112,7 @@ def flow_px(name: str, size: tuple[int, int], seed: int, from_s: float, to_s: fl
 
 
 def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> RenderedScene:
-    """Return all views of a world that `tabulated` laid out, and the disparity, as `render`."""
+    """Return all views of a world that `tabulated` laid out."""
     steps = max(views)
     apertures = [
         ((v - (views[0] - 1) / 2) / steps, (u - (views[1] - 1) / 2) / steps)
@@ -118,15 +126,7 @@ def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> R
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         list(pool.map(paint, range(len(apertures))))
-    return RenderedScene(light_field.reshape(*views, *size, 3), _disparity_px(tables, views, size))
-
-
-def rendered_disparity_px(
-    name: str, views: tuple[int, int], size: tuple[int, int], seed: int, time_s: float = 0.0
-) -> np.ndarray:
-    """Return the disparity alone of what `render` returns, (y, x) float32; raises SceneError."""
-    _check(name, views, size, seed)
-    return _disparity_px(_tables(name, seed, time_s), views, size)
+    return RenderedScene(light_field.reshape(*views, *size, 3), tables)
 
 
 def _check(name: str, views: tuple[int, int], size: tuple[int, int], seed: int) -> None:
@@ -139,13 +139,6 @@ def _check(name: str, views: tuple[int, int], size: tuple[int, int], seed: int) 
         raise SceneError(f"{size[0]}x{size[1]} pixels: needs {_SMALLEST_PX}x{_SMALLEST_PX} or more")
     if seed < 0:
         raise SceneError(f"seed {seed}: needs 0 or more")
-
-
-def _disparity_px(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
-    steps = max(views)
-    a_t, a_s = ((n // 2 - (n - 1) / 2) / steps for n in views)
-    d, _ = surfaces(pixel_centres(size), a_s, a_t, tables)
-    return (d * (size[1] / steps)).astype(np.float32)
 
 
 @lru_cache(maxsize=2)

@@ -34,9 +34,11 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     SpinnerColumn,
+    Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
+    TimeRemainingColumn,
 )
 from rich.table import Table
 from rich.text import Text
@@ -58,6 +60,8 @@ if TYPE_CHECKING:
 console = Console(stderr=True)
 json_wanted: ContextVar[bool] = ContextVar("json_wanted", default=False)
 """Whether the running command was given --json."""
+PACE_S = 300.0
+"""Of a bar, over which its pace is averaged: a study's point may take a minute."""
 WORDS = {
     "name-frame": "such as --frame 0",
     "reconstruct": "run `emmc-rig reconstruct {about}`",
@@ -279,14 +283,24 @@ class Bars(Shown):
             self._progress.update(self._task, total=done, completed=done, detail="")
 
 
-def columns() -> tuple[ProgressColumn, ...]:
-    """Return what a bar shows: stage, share, steps, time, and a detail."""
+class TimeLeft(TimeRemainingColumn):
+    """Time left of a bar whose number of steps is known, from the pace of its latest steps."""
+
+    def render(self, task: Task) -> Text:
+        """Return the time left, or an empty text while it is unknown and at the end."""
+        known = task.time_remaining is not None and not task.finished
+        return super().render(task).append(" left") if known else Text()
+
+
+def columns(*after_time: ProgressColumn) -> tuple[ProgressColumn, ...]:
+    """Return what a bar shows: stage, share, steps, time, further columns, and a detail."""
     return (
         SpinnerColumn(),
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        *after_time,
         TextColumn("[dim]{task.fields[detail]}"),
     )
 
@@ -297,7 +311,10 @@ def shown_progress(stage: str | None = None) -> Iterator[Shown]:
 
     The last bar is filled if the block ends well.
     """
-    with Progress(*columns(), console=console, disable=not console.is_terminal) as progress:
+    with Progress(
+        *columns(TimeLeft()), console=console, disable=not console.is_terminal,
+        speed_estimate_period=PACE_S,
+    ) as progress:  # fmt: skip
         shown = (
             Lines() if json_wanted.get() else Bars(progress) if console.is_terminal
             else Shown()

@@ -27,7 +27,7 @@ from emmc_rig.model.lightfield import (
 from emmc_rig.model.view_axes import ANGLES, shows_parallax
 from emmc_rig.model.view_order import ViewOrder, order_of
 from emmc_rig.simulators.raycaster import World
-from emmc_rig.simulators.scenes import SCENES, render, rendered_disparity_px
+from emmc_rig.simulators.scenes import SCENES, render
 from emmc_rig.store import shards
 
 APERTURE_FACTOR, PIXEL_FACTOR = 2, 2
@@ -42,7 +42,8 @@ BY_PARALLAX = "@by-parallax"
 class Scene:
     """A light field (v, u, y, x, 3) with its origin, and its disparity if known.
 
-    `disparity_px` is (y, x), pixels per view step, of the centre view; None for measured scenes.
+    `disparity_px` is (y, x), pixels per view step, of the centre view. Measured scenes have none,
+    nor have the truths of simulated captures.
     NumPy takes a scene as its light field: `psi @ scene`.
     """
 
@@ -74,7 +75,8 @@ class FineScene:
     """A scene on the grid a capture is simulated on, finer than the one it is reconstructed on.
 
     `samples` is (v a, u a, y p, x p, 3) for `aperture_factor` a and `pixel_factor` p;
-    `scene.light_field` is its box average over a x a views and p x p pixels: the truth.
+    `scene.light_field` is its box average over a x a views and p x p pixels: the truth. Its
+    disparity is not computed.
     """
 
     scene: Scene
@@ -211,14 +213,13 @@ def fine_scene(
     (height, width), (n_v, n_u) = _asked_shape(size, views)[::-1]
     fine_views = n_v * aperture_factor, n_u * aperture_factor
     fine_size = height * pixel_factor, width * pixel_factor
-    disparity_px = rendered_disparity_px(spec, (n_v, n_u), (height, width), seed, time_s)
     samples = render(spec, fine_views, fine_size, seed, time_s=time_s).light_field
     truth = box_average(samples, aperture_factor, pixel_factor)
     provenance = (
         f"{_described(spec, (n_v, n_u), (height, width), seed)}, the average of "
         f"{aperture_factor}x{aperture_factor} views and {pixel_factor}x{pixel_factor} pixels"
     )
-    scene = Scene(spec, truth, disparity_px, provenance)
+    scene = Scene(spec, truth, None, provenance)
     return FineScene(scene, samples, aperture_factor, pixel_factor)
 
 

@@ -176,6 +176,8 @@ class ImagingMatrix(PsiLayout):
             raise SensingError(f"colour map of shape {self.colour.shape} does not fit the weights")
         if self.colour is not None and self.colour.max() > 2:
             raise SensingError("the colour map names colours beyond red, green and blue")
+        if self.colour is not None:  # kernels are compiled for one layout
+            object.__setattr__(self, "colour", np.array(self.colour, order="C", copy=None))
         if self.size[0] % self.binning or self.size[1] % self.binning:
             raise SensingError(f"pixels of {self.binning}^2 samples do not divide {self.size}")
         if not all(np.isfinite(plane).all() for plane in self.view_planes()):

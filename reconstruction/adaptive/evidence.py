@@ -14,7 +14,8 @@ averaged.
 Products of a patch: m R S for spectra of its rays, 2 m^2 / 2 S to correlate them, m^2 / 2 S of each
 texture (a length and a disparity) for its covariance, and m^3 / 6 of each and of each of P trials
 of the kinds, for its factor; R rays a pixel (25, or 25 k^2), S distinct separations of them (81).
-For m = 64 and 20 textures, P = 27: 0.1, 0.3, 3.5 and 2.1 million.
+For m = 64 and 20 textures, P = 27: 0.1, 0.3, 3.5 and 2.1 million. Behind a coded aperture alone all
+patches share the spectra and covariances.
 """
 
 from __future__ import annotations
@@ -159,6 +160,12 @@ class PatchEvidence:
     kind: NDArray[np.int64]
 
 
+def _alike(psi: ImagingMatrix) -> bool:
+    """Return whether Psi is the same at every pixel, as that of a coded aperture alone."""
+    row = psi.weights[:, :, :, :1]
+    return bool((row == row[..., :1]).all() and (psi.weights == row).all())
+
+
 def _sets(
     pixels_apart: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -284,14 +291,17 @@ def patch_evidence(
         chromas,
         _trials(len(lengths), len(prior.kinds), prior.kept if kinds is None else 0),
         np.float32(prior.freedom),
+        np.empty(0, dtype=np.int64),
     )
+    alike = _alike(psi)
     scales = np.square(brightness).astype(np.float32)[padded]
 
     def evaluate(first: int) -> None:
         groups = slice(first, first + GROUPS)
         lanes = slice(first * LANES, (first + GROUPS) * LANES)
+        shared = np.unique(textures[groups]) if alike else given.shared
         evidence(
-            given,
+            given._replace(shared=shared),
             corners[padded[lanes]],
             scales[lanes],
             textures[groups],

@@ -39,6 +39,8 @@ LEAST = 1e-12
 """Of a squared pivot: of a covariance that is not positive definite in float32."""
 LOWEST = np.float32(-1e30)
 """Below any log-likelihood; fast arithmetic knows no infinity."""
+UNKNOWN = np.float32(1e6)
+"""Variance of a reading that is not usable, where all patches share covariances."""
 LOGS = 8
 """Tiles of pivots between logarithms: 32 of 1e6 each are far from the end of float64."""
 
@@ -66,6 +68,8 @@ class Hypotheses(NamedTuple):
         chromas: of kinds, variance of a chrominance over that of luminance, (kind,).
         trials: length, probe and rank of the kinds to try, in order, (trial, 3).
         freedom: degrees of the Student t.
+        shared: textures whose covariances all patches share, since Psi is the same at every pixel;
+            none where each patch has its own.
     """
 
     weights: Any
@@ -84,6 +88,7 @@ class Hypotheses(NamedTuple):
     chromas: Any
     trials: Any
     freedom: Any
+    shared: Any
 
 
 @njit(forceinline=True, fastmath=True)
@@ -91,12 +96,14 @@ def _gather(given, corners, rays, known, seen, measured):
     """Cut Psi, data, variances and colours into patches, one a lane; nothing where not usable.
 
     corners: (lane, 2) of pixels. rays: (part, reading, ray, lane), luminance and, where three
-    colours are stored, two chrominances. known: (2, reading, lane), data and variance. seen:
-    (reading, lane) colour. measured: (lane,), how many are usable. All are set.
+    colours are stored, two chrominances, of usable readings, or all where they are shared. known:
+    (2, reading, lane), data and variance. seen: (reading, lane) colour. measured: (lane,), how many
+    are usable. All are set.
     """
+    shared = given.shared.size > 0
     rays[:] = 0
     known[0] = 0
-    known[1] = 1
+    known[1] = UNKNOWN if shared else np.float32(1)
     seen[:] = 0
     measured[:] = 0
     weights, colour, usable, data, variance, places, binning = given[:7]
@@ -106,11 +113,12 @@ def _gather(given, corners, rays, known, seen, measured):
         s = places[i, 0]
         for lane in range(lanes):
             y, x = corners[lane, 0] + places[i, 1], corners[lane, 1] + places[i, 2]
-            if not usable[s, y, x]:
+            if usable[s, y, x]:
+                measured[lane] += 1
+                known[0, i, lane] = data[s, y, x]
+                known[1, i, lane] = variance[s, y, x]
+            elif not shared:
                 continue
-            measured[lane] += 1
-            known[0, i, lane] = data[s, y, x]
-            known[1, i, lane] = variance[s, y, x]
             if stored == 1:
                 seen[i, lane] = colour[s, y * binning, x * binning]
             a = 0
@@ -294,9 +302,15 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
     terms, inputs = given.waves.shape
     blocks = m // SIDE
     entries = blocks * (blocks + 1) // 2 * SIZE
-    most = 0
-    for count in counts:
-        most = max(most, -(-count // SIDE) * SIDE)
+    # With shared covariances the first group's are those of all groups, at `where`.
+    shared = given.shared.size
+    most = -(-shared // SIDE) * SIDE
+    if shared == 0:
+        for count in counts:
+            most = max(most, -(-count // SIDE) * SIDE)
+    where = np.arange(max(most, given.tables.shape[1]))
+    for h in range(shared):
+        where[given.shared[h]] = h
     parts = 1 if stored == 1 else 3
     rays = np.empty((parts, m, inputs, LANES), np.float32)
     spectra = np.empty((parts, m, terms * LANES), np.float32)
@@ -319,12 +333,14 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
     for group in range(counts.size):
         first = group * LANES
         _gather(given, corners[first : first + LANES], rays, known, seen, measured)
-        _analyse(given.waves, rays, wave_starts, columns, spectra)
         count = counts[group]
-        starts = np.empty(-(-count // SIDE) * SIDE, np.int64)
-        for h in range(starts.size):
-            starts[h] = textures[group, min(h, count - 1)] * terms
-        _correlate(given, spectra, starts, meetings, sums)
+        if shared == 0 or group == 0:
+            _analyse(given.waves, rays, wave_starts, columns, spectra)
+            correlated = given.shared if shared > 0 else textures[group, :count]
+            starts = np.empty(-(-correlated.size // SIDE) * SIDE, np.int64)
+            for h in range(starts.size):
+                starts[h] = correlated[min(h, correlated.size - 1)] * terms
+            _correlate(given, spectra, starts, meetings, sums)
         if stored == 1:
             _compare_colours(given, seen, alike)
         each = count // lengths
@@ -350,7 +366,7 @@ def evidence(given, corners, scales, textures, counts, probes, out, chosen):
                 mix[lane] = strength * grey
                 mix[LANES + lane] = strength * given.chromas[kind]
             _log_likelihood(
-                sums[h],
+                sums[where[textures[group, h]] if shared > 0 else h],
                 alike,
                 mix,
                 known,

@@ -27,9 +27,10 @@ from emmc_rig.reconstruction.adaptive.uncertainty import (
 )
 
 Array = NDArray[np.floating]
-Patches = Callable[[NDArray[np.bool_]], Array]
+Patches = Callable[[NDArray[np.bool_], Array], Array]
 """Returns a light field (v, u, y, x, c) of sparse patches to average with in place of total
-variation's, given which readings to fit and the order in which its views lie."""
+variation's, given which readings to fit, (shot, pixel_y, pixel_x), and the centre view's disparity,
+(y, x)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +161,7 @@ def fitted_models(
     enough = settings.uses_patches(given.psi.shots)
     patched = patches is not None and (enough or surfaces_fail(survey, residuals))
     if patches is not None and patched:
-        seen = patches(given.usable & ~held)
+        seen = patches(given.usable & ~held, scene.centre)
         light_fields.append(mixture.stored(seen))
         residuals.append(given.frames - given.psi.forward(seen))
     else:

@@ -16,22 +16,34 @@ from emmc_rig.reconstruction.adaptive.method import (
     reconstruct_next,
 )
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings, fast
-from emmc_rig.reconstruction.dictionary import Dictionary, lambertian_dictionary, usual_patch
+from emmc_rig.reconstruction.dictionary import lambertian_dictionary, planes_of_scene, usual_patch
 from emmc_rig.reconstruction.method import Given, Method, Sensitivity, ShippedSettings, cost_words
 from emmc_rig.reconstruction.methods.variational import solve_tv_dict
 from emmc_rig.reconstruction.result import Reconstruction
 from emmc_rig.reconstruction.sparse import SparseSettings
 
+Array = NDArray[np.floating]
 PATCH_RTOL, PATCH_STEPS = 1e-2, 100
 """Of the patches beside surfaces. On 64x80 middles with three shots those of `tv-dict` itself cost
 buttercup 1.1 times the time for 0.00 dB, begonia several times for less than 0.1 dB; 30 steps cost
-begonia 0.3 dB. A stride of 6 or 7, for 5, costs buttercup 0.7 and 0.4 dB, two shots."""
+begonia 0.3 dB. A stride of 5 for patches of 6 costs buttercup 0.5 dB, three shots."""
+PATCH_TV_RTOL = 1e-3
+"""Of total variation drawn towards them. 3e-4 gains 0.00 dB (antinous -0.07), group A, three shots;
+3e-3 costs 0.01 dB, and antinous 0.1."""
 
 
-def sparse_patches(settings: SparseSettings, binning: int) -> SparseSettings:
-    """Return the settings of the patches that `adaptive` averages with: they cut no pixel, and are
-    less exact."""
-    stride = max(settings.stride // binning * binning, binning)
+def patch_of(psi: ImagingMatrix) -> tuple[int, int]:
+    """Return rows and columns of the patches that `adaptive` averages with."""
+    return usual_patch(psi.binning, psi.shots, psi.views)
+
+
+def sparse_patches(settings: SparseSettings, psi: ImagingMatrix) -> SparseSettings:
+    """Return the settings of the patches that `adaptive` averages with.
+
+    Patches lie at most two thirds of their width apart, cut no pixel, and are less exact.
+    """
+    binning, side = psi.binning, patch_of(psi)[0]
+    stride = max(min(settings.stride, -(-2 * side // 3)) // binning * binning, binning)
     exact = {"rtol": PATCH_RTOL, "max_steps": PATCH_STEPS}
     solver = settings.solver.model_copy(update=exact)
     return settings.model_copy(update={"stride": stride, "solver": solver})
@@ -39,7 +51,9 @@ def sparse_patches(settings: SparseSettings, binning: int) -> SparseSettings:
 
 def patches_fit(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
     """Return whether `adaptive` may average with sparse patches: if one fits."""
-    return settings.patches is not None and min(psi.size) >= max(usual_patch(psi.binning))
+    return settings.patches is not None and min(psi.size) >= max(
+        usual_patch(psi.binning, psi.shots)
+    )
 
 
 def _patches(psi: ImagingMatrix, settings: ShippedSettings) -> SparseSettings | None:
@@ -47,12 +61,10 @@ def _patches(psi: ImagingMatrix, settings: ShippedSettings) -> SparseSettings | 
     adaptive = settings.adaptive
     if not (patches_fit(psi, adaptive) and adaptive.uses_patches(psi.shots)):
         return None
-    return sparse_patches(settings.sparse, psi.binning)
+    return sparse_patches(settings.sparse, psi)
 
 
-@lru_cache(maxsize=1)
-def _dictionary(views: tuple[int, int], binning: int) -> Dictionary:
-    return lambertian_dictionary(views, usual_patch(binning))
+_dictionary = lru_cache(maxsize=1)(lambertian_dictionary)
 
 
 def _solve(
@@ -69,14 +81,18 @@ def _solve(
     adaptive, psi = chosen(settings.adaptive), given.psi
     present = given.of_first_shot() if given.moving else given
 
-    def patches(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def patches(usable: NDArray[np.bool_], disparity: Array) -> NDArray[np.float32]:
         """Return the light field of `tv-dict`, less exact, from some of the readings."""
-        atoms = _dictionary(psi.light_field_shape[:2], psi.binning)
+        shape = psi.light_field_shape[:2], patch_of(present.psi)
+        atoms = _dictionary(*shape, planes_of_scene(*shape, disparity))
         frames = dataclasses.replace(present.frames, usable=usable)
         fitted = dataclasses.replace(present, frames=frames, dictionary=atoms, on_step=None)
-        sparse = sparse_patches(settings.sparse, psi.binning)
-        unseen = settings.tv.model_copy(update={"objective_every": settings.tv.max_steps + 1})
-        quick = settings.model_copy(update={"sparse": sparse, "tv": unseen})
+        sparse = sparse_patches(settings.sparse, present.psi)
+        tv: dict[str, float] = {"objective_every": settings.tv.max_steps + 1}
+        if "rtol" not in settings.tv.model_fields_set:  # Blocks set it, to take equal steps.
+            tv["rtol"] = PATCH_TV_RTOL
+        coarse = settings.tv.model_copy(update=tv)
+        quick = settings.model_copy(update={"sparse": sparse, "tv": coarse})
         return solve_tv_dict(fitted, quick).light_field
 
     film, solved = given.film, None

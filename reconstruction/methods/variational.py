@@ -19,23 +19,27 @@ from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
 Array = NDArray[np.floating]
 PATCHED_MU, PATCHED_RHO = 3.0, 18.0
 """Factors of mu and rho with a patch term, see `patched_weights`."""
-PATCH_AREA = 81
-"""Samples of the patches for which the factors were fitted: 9 x 9."""
 
 
 def patched_weights(
-    tv: TVSettings, sparse: SparseSettings, psi: ImagingMatrix, readings: Array, noise_sigma: float
+    tv: TVSettings,
+    sparse: SparseSettings,
+    patch: tuple[int, int],
+    psi: ImagingMatrix,
+    readings: Array,
+    noise_sigma: float,
 ) -> TVSettings:
     """Return the settings with mu and rho chosen for a patch term, where they are not set.
 
-    readings: the usable ones. mu is 3 times that of total variation alone, rho 18 mu / (brightness
-    cover), the cover being the number of patches on a sample. The factors were fitted on two full
-    real light fields and six crops (Bayer, monochrome and RGB, one and three shots): 6 is better
-    by 0.2 to 0.9 dB where total variation alone beats the patches, 18 by 0.3 to 0.6 dB elsewhere.
+    patch: rows and columns, in samples. readings: the usable ones. mu is 3 times that of total
+    variation alone, rho 18 mu / (brightness cover), the cover being the number of patches on a
+    sample. The factors were fitted on two full real light fields and six crops (Bayer, monochrome
+    and RGB, one and three shots): 6 is better by 0.2 to 0.9 dB where total variation alone beats
+    the patches, 18 by 0.3 to 0.6 dB elsewhere.
     """
     mu = tv.mu or PATCHED_MU * choose_mu(psi, readings, noise_sigma, tv.order)
     brightness = max(float(np.mean(readings)) / max(psi.light_efficiency(), 1e-12), 1e-12)
-    cover = PATCH_AREA / sparse.stride**2
+    cover = patch[0] * patch[1] / sparse.stride**2
     rho = tv.rho if "rho" in tv.model_fields_set else PATCHED_RHO * mu / (brightness * cover)
     return tv.model_copy(update={"mu": mu, "rho": rho})
 
@@ -55,7 +59,8 @@ def solve_tv_dict(given: Given, settings: ShippedSettings) -> Reconstruction:
     first_s = running_s() - started
     term = PatchTerm(estimates.light_field, estimates.weight)
     readings = frames.readings[frames.usable]
-    tv = patched_weights(settings.tv, settings.sparse, psi, readings, frames.noise_sigma)
+    patch = dictionary.patch_shape[2:4]
+    tv = patched_weights(settings.tv, settings.sparse, patch, psi, readings, frames.noise_sigma)
     result = reconstruct_tv(psi, frames, tv, given.on_step, term)
     return dataclasses.replace(
         result,

@@ -7,6 +7,7 @@ import pytest
 import typer
 from programs import done, program
 from rich.console import Console
+from rich.progress import Progress
 
 from emmc_rig import cli
 from emmc_rig.commands import output
@@ -104,3 +105,16 @@ def test_progress_is_drawn_on_a_terminal_and_nowhere_else(folder, monkeypatch, t
     assert "sensor PSNR" in out
     assert err == ""
     assert ("simulate" in drawn.getvalue()) is terminal
+
+
+def test_a_bar_shows_the_time_left_while_it_is_known():
+    clock_s = [0.0]
+    progress = Progress(get_time=lambda: clock_s[-1], disable=True)
+    progress.add_task("cells", total=4)
+    task = progress.tasks[0]
+    words = [output.TimeLeft().render(task).plain]
+    for _ in range(4):
+        clock_s.append(clock_s[-1] + 10)
+        progress.advance(task.id)
+        words.append(output.TimeLeft().render(task).plain)
+    assert words == ["", "", "0:00:20 left", "0:00:10 left", ""]

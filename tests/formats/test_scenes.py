@@ -95,9 +95,6 @@ def test_the_box_average_is_nearly_the_scene_rendered_coarsely(name, aperture_fa
     fine = fine_scene(name, aperture_factor, 2, (192, 256), views=(2, 2))
     coarse = open_scene(name, (192, 256), views=(2, 2))
     assert psnr_db(coarse.light_field, fine.scene.light_field) > at_least_db
-    assert fine.scene.disparity_px is not None
-    assert coarse.disparity_px is not None
-    np.testing.assert_array_equal(fine.scene.disparity_px, coarse.disparity_px)
 
 
 @pytest.mark.parametrize("pixel_factor", [1, 2, 3])

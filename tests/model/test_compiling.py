@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba.core.compiler import Flags
+from numba.core.targetconfig import TargetConfig
 
 from emmc_rig.model import compiling
 
@@ -280,6 +282,22 @@ def test_what_is_compiled_into_kernels_alone_says_so_when_it_is_called(own_kerne
     with pytest.raises(TypeError, match="call its `py_func`"):
         own_kernel.half(1.0)
     assert own_kernel.half.py_func(1.0) == 0.5
+
+
+def test_flags_are_equal_where_numba_calls_them_equal():
+    def flags(**options):
+        made = Flags()
+        for name, value in options.items():
+            setattr(made, name, value)
+        return made
+
+    every = [flags(), flags(nrt=False), flags(nrt=True), flags(nrt=True, forceinline=True)]
+    for first in every:
+        assert hash(first) == TargetConfig.__hash__(first)
+        assert first != "flags"
+        for second in every:
+            assert (first == second) is TargetConfig.__eq__(first, second)
+    assert every[0] == every[1]
 
 
 @pytest.mark.slow

@@ -170,6 +170,17 @@ def test_forward_is_its_plain_definition_and_reaches_no_other_colour(coded_camer
     assert not psi.to_scipy().toarray()[:, unseen.ravel()].any()
 
 
+def test_kernels_meet_one_layout_of_the_colour_map():
+    """Each layout would be compiled for: maps that lie otherwise in memory are copied."""
+    weights = np.ones((2, 1, 1, 4, 1, 6), np.float32)
+    colour = np.arange(48, dtype=np.uint8).reshape(2, 4, 6) % 3
+    for given in (colour, colour[..., ::-1], np.broadcast_to(colour[:1], colour.shape)):
+        kept = ImagingMatrix(weights, given).colour
+        assert kept is not None
+        assert kept.flags.c_contiguous
+        np.testing.assert_array_equal(kept, given)
+
+
 @pytest.mark.parametrize("binning", [1, 2, 3])
 @pytest.mark.parametrize("cfa", TILES, ids=str)
 def test_an_open_camera_reads_1_from_a_white_light_field(cfa, binning):

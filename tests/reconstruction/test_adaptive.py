@@ -108,6 +108,36 @@ def evidence_of_patches(psi, prior, **given):
     return found, len(corners)
 
 
+@pytest.mark.parametrize("stored", [1, 3])
+def test_patches_behind_a_coded_aperture_share_covariances(random_psi, monkeypatch, stored):
+    psi = random_psi(2, (3, 3), (19, 40), stored)
+    aperture = np.broadcast_to(psi.weights[:, :, :, :1, :, :1], psi.weights.shape)
+    psi = replace(psi, weights=np.ascontiguousarray(aperture))
+    data = np.random.default_rng(0).normal(0, 0.1, psi.frames_shape).astype(np.float32)
+    usable = np.random.default_rng(1).random(psi.frames_shape) > 0.1
+    patches, prior = EvidencePatches(4, 2), TexturePrior(3.0, (1.5,))
+    grid = np.meshgrid(*patches.grid(data.shape[1:]), indexing="ij")
+    corners = np.stack(grid, axis=-1).reshape(-1, 2)
+    asked = np.random.default_rng(2).random((len(corners), 7)) > 0.6
+    asked[:, 3] = True
+
+    def found():
+        return patch_evidence(
+            psi, data, np.full(data.shape, 1e-4), usable, np.full(len(corners), 0.5), corners,
+            patches.places(2), np.linspace(-1, 1, 7), prior, asked,
+        )  # fmt: skip
+
+    shared = found()
+    monkeypatch.setattr("emmc_rig.reconstruction.adaptive.evidence._alike", lambda _: False)
+    single = found()
+    np.testing.assert_array_equal(shared.kinds, single.kinds)
+    evaluated = np.isfinite(single.log_likelihood)
+    np.testing.assert_array_equal(np.isfinite(shared.log_likelihood), evaluated)
+    # What is not usable adds the same to all disparities of a patch.
+    shift = np.where(evaluated, shared.log_likelihood - single.log_likelihood, np.nan)
+    assert np.nanmax(np.nanmax(shift, axis=1) - np.nanmin(shift, axis=1)) < 0.02
+
+
 def test_the_evidence_of_several_lengths_is_the_mean_likelihood_of_each(coded_psi):
     psi = coded_psi(size=(14, 16))
     long, short, both = (

@@ -11,6 +11,7 @@ from emmc_rig.reconstruction.dictionary import (
     dct_dictionary,
     lambertian_dictionary,
     plane_disparities,
+    planes_of_scene,
 )
 from emmc_rig.reconstruction.errors import DictionaryError, ReconstructionError
 
@@ -247,3 +248,19 @@ def test_the_defaults_fit_any_views_and_patch(views, patch):
 def test_disparities_that_show_nothing_are_refused(disparities):
     with pytest.raises(DictionaryError, match="pixels per view step"):
         lambertian_dictionary((5, 5), (9, 9), disparities)
+
+
+@pytest.mark.parametrize(
+    ("lowest", "highest", "planes"),
+    [
+        (-0.3, 0.4, (-0.5, 0, 0.5)),
+        (-0.5, 0.5, (-0.5, 0, 0.5)),
+        (0.6, 0.9, (0.5, 1)),
+        (-9, 9, (-1.5, -1, -0.5, 0, 0.5, 1, 1.5)),
+        (7, 9, (1.5,)),
+    ],
+)
+def test_a_scene_needs_the_planes_of_its_disparities(lowest, highest, planes):
+    disparity = np.linspace(lowest, highest, 500).reshape(20, 25)
+    disparity[0, 0], disparity[-1, -1] = -20, 20  # too rare to count
+    assert planes_of_scene((5, 5), (6, 6), disparity) == planes

@@ -101,7 +101,7 @@ def test_the_default_method_needs_no_dictionary():
 
 @pytest.mark.parametrize(
     ("shots", "size", "binning", "takes"),
-    [(1, (24, 24), 1, False), (2, (24, 24), 1, True), (2, (8, 24), 1, False), (2, (8, 8), 2, True)],
+    [(1, (24, 24), 1, False), (2, (24, 24), 1, True), (2, (5, 24), 1, False), (2, (8, 8), 2, True)],
 )
 def test_adaptive_takes_patches_from_two_shots_where_one_fits(
     random_psi, shots, size, binning, takes
@@ -125,10 +125,24 @@ def test_blocks_and_time_budgets_ask_the_method_and_name_none():
         assert method.scout is None or METHODS[method.scout].settings is method.settings
 
 
+@pytest.mark.parametrize("shots", [1, 2, 3, 9, 16])
 @pytest.mark.parametrize("binning", range(1, 18))
-def test_the_patches_of_adaptive_cut_no_pixel_and_leave_no_gap(binning):
-    stride = sparse_patches(SparseSettings(), binning).stride
-    assert len(regular_grid((20 * binning,) * 2, usual_patch(binning), stride, binning)) > 1
+def test_the_patches_of_adaptive_cut_no_pixel_and_leave_no_gap(random_psi, binning, shots):
+    size = (10 * binning, 10 * binning)
+    psi, patch = (
+        random_psi(shots, (1, 1), size, binning=binning),
+        usual_patch(binning, shots, (1, 1)),
+    )
+    stride = sparse_patches(SparseSettings(), psi).stride
+    assert len(regular_grid(size, patch, stride, binning)) > 1
+
+
+@pytest.mark.parametrize(
+    ("shots", "binning", "side"),
+    [(1, 1, 9), (2, 1, 6), (6, 1, 6), (9, 1, 4), (60, 1, 4), (3, 2, 8)],
+)
+def test_patches_of_several_shots_are_smaller(shots, binning, side):
+    assert usual_patch(binning, shots) == (side, side)
 
 
 def test_settings_of_version_0_2_open_with_a_warning_for_what_is_gone():

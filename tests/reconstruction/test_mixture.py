@@ -5,6 +5,7 @@ import pytest
 
 from emmc_rig.reconstruction.adaptive.mixture import (
     HIDDEN,
+    PATCHES_CHANCE,
     PATCHES_POWER,
     averaged,
     beside_patches,
@@ -56,7 +57,14 @@ def test_surfaces_that_err_alike_count_once_beside_patches(held):
     np.testing.assert_allclose(share.sum(axis=0), 1, rtol=1e-5)
     np.testing.assert_allclose(share[0], share[1], rtol=1e-5)
     odds = np.median(share[2] / (share[0] + share[1]))
-    assert odds == pytest.approx(HIDDEN**PATCHES_POWER, rel=0.3)
+    assert odds == pytest.approx(PATCHES_CHANCE * HIDDEN**PATCHES_POWER, rel=0.3)
+
+
+def test_patches_that_err_by_noise_as_surfaces_do_have_a_small_share(held):
+    surfaces, patches = misses(0.0, 0.0)
+    share = beside_patches([surfaces, patches], noise(), held)
+    odds = share[1].mean() / share[0].mean()
+    assert odds == pytest.approx(PATCHES_CHANCE, rel=0.3)
 
 
 @pytest.mark.parametrize(("surface", "patch"), [(0.02, 0.01), (0.01, 0.02)])

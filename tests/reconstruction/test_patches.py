@@ -8,7 +8,6 @@ from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.patches import (
     overlap_add,
     padded,
-    pixel_of_sample,
     regular_grid,
     selected_atoms,
     sense_atoms,
@@ -70,17 +69,15 @@ def test_sensed_atoms_are_what_psi_makes_of_the_atoms_there(
     usable = rng.uniform(size=psi.frames_shape) > 0.2
     frames = rng.normal(size=psi.frames_shape)
     found = sense_patches(psi, even_frames(frames, 0.0, usable), corners, patch)
-    pixel = pixel_of_sample(patch, binning)
-    pixels = int(pixel.max()) + 1
+    pixels = patch[0] * patch[1] // binning**2
     for i, (y, x) in enumerate(corners):
         seen = np.zeros((1, 3, padded(shots * pixels)), dtype=np.float32)
         for shot in range(shots):
             colours = None
             if psi.colour is not None:
                 colours = psi.colour[shot, y : y + patch[0], x : x + patch[1]].ravel()
-            selected = selected_atoms(atoms, colours)
-            weights = np.ascontiguousarray(found.weights[i : i + 1, shot])
-            sense_atoms(selected, weights, pixel, pixels, shot, seen)
+            selected = selected_atoms(atoms, colours, binning)
+            sense_atoms(selected, found.weights[shot][:, i : i + 1], shot, seen)
         cut = np.s_[
             :, y // binning : (y + patch[0]) // binning, x // binning : (x + patch[1]) // binning
         ]

@@ -9,7 +9,12 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
-from emmc_rig.reconstruction.screening import bad_pixels, neighbour_range, screened
+from emmc_rig.reconstruction.screening import (
+    bad_pixels,
+    neighbour_range,
+    screened,
+    shot_gains,
+)
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture
 
@@ -108,6 +113,18 @@ def test_flicker_is_measured_and_evened(percent):
     assert seen.frames.readings == pytest.approx(
         trial.readings / seen.gains[:, None, None], rel=1e-5
     )
+
+
+def test_shots_behind_filters_are_compared_with_shots_of_the_same_colour():
+    """A scene without much green and blue is darker behind these filters, and does not flicker."""
+    capture = Capture("near-planar", find_camera("scenario-i-rgb").with_shots(6), SIZE, zoom=3)
+    psi = capture.psi()
+    tinted = capture.scene_seen().light_field * np.array([1, 0.3, 0.2], np.float32)
+    readings, usable = psi.forward(tinted), np.ones(psi.frames_shape, bool)
+    assert (shot_gains(psi, readings, usable) == 1).all()
+    readings[4] *= 0.9  # the second green shot, of two
+    expected = [1, 1 / 0.95, 1, 1, 0.9 / 0.95, 1]
+    assert shot_gains(psi, readings, usable) == pytest.approx(expected, abs=0.01)
 
 
 @pytest.mark.parametrize("camera", ["rgbw-bayer-3shots", "rgbw-bayer-1shot", "scenario-ii-cfa"])

@@ -120,7 +120,7 @@ def test_a_known_disparity_is_not_searched_again(monkeypatch, known):
 def test_one_shot_asks_for_patches_where_surfaces_fail(monkeypatch, fail):
     trial, asked = wide_trial(1), []
 
-    def patches(usable):
+    def patches(usable, _):
         asked.append(usable)
         return np.full(trial.truth.shape, 0.5, np.float32)
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
@@ -11,8 +12,9 @@ from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruction.bpdn import BPDNSettings
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import DictionaryError, ReconstructionError
+from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, find_method, reconstruct
-from emmc_rig.reconstruction.sparse import SparseSettings, reconstruct_sparse
+from emmc_rig.reconstruction.sparse import SparseSettings, estimate_patches, reconstruct_sparse
 
 VIEWS, PATCH = (3, 3), (6, 6)
 
@@ -158,6 +160,22 @@ def test_progress_counts_the_patches(random_psi, scene):
     solved(psi, truth, dictionary, on_step=reported.append)
     assert reported[-1].step == reported[-1].total == 20
     assert [p.step for p in reported] == sorted(p.step for p in reported)
+
+
+def test_patches_are_coded_with_one_blas_thread(random_psi, scene):
+    """As many threads code patches as there are cores; with two of BLAS each they take 4 times."""
+    dictionary, truth = scene
+    psi = random_psi(1, VIEWS, truth.shape[2:4])
+    given = checked_inputs(psi, even_frames(psi.forward(truth), 0.01))
+    threads = set()
+
+    def note(_):
+        blas = (item for item in threadpool_info() if item["user_api"] == "blas")
+        threads.update(item["num_threads"] for item in blas)
+
+    with threadpool_limits(2, "blas"):
+        estimate_patches(psi, given, dictionary, SparseSettings(), note)
+    assert threads == {1}
 
 
 def test_what_does_not_fit_is_refused(random_psi, scene):

@@ -72,14 +72,14 @@ class TablesSettings(Settings):
 
 
 FAST = TablesSettings(
-    size=(96, 128),
-    binned_size=(64, 80),
+    size=(48, 48),
+    binned_size=(32, 32),
     methods=MethodSettings(
         tv=TVSettings(max_steps=100),
         sparse=SparseSettings(solver=BPDNSettings(method="admm", rtol=1e-2, max_steps=200)),
     ),
 )
-"""Crops: all tables on nine scenes in minutes."""
+"""Crops: all tables on thirteen scenes in three minutes on two cores."""
 
 
 def scene_specs(folder: Path | None) -> dict[str, str]:
@@ -174,12 +174,16 @@ class TablesStudy(Study[Cell]):
     journal = "cells.jsonl"
     noun = "cells"
     stage = "reconstruct"
-    revision = 2
+    revision = 3
     command, title, page = "tables", "The paper's tables, reproduced", "tables.html"
     caveats = (
         "The paper's figures are for orientation: its aperture variant of the MIT scenes and its "
         "distance from mask to sensor are unknown. Compare methods and scenarios within one run.",
         "The paper's means are over all of its scenes, whether they are measured here or not.",
+        "In the paper three monochrome shots lead three CFA shots; here they trail them. Columns "
+        "without noise depend on neither light nor the unit of noise, and the mask is the paper's. "
+        "The dictionary differs: the paper's was trained, ours needs no training, and the paper's "
+        "penalty is not stated.",
     )
     columns: ClassVar[Mapping[str, Sequence[str]]] = {
         CSV: (
@@ -220,7 +224,9 @@ class TablesStudy(Study[Cell]):
         for binning in {cell.setup.binning for cell in self.cells}:
             self.dictionary(binning)
         for cell in {cell.scene: cell for cell in self.cells}.values():
-            rows, columns = self.capture(cell).scene_seen().size
+            capture = self.capture(cell)
+            rows, columns = capture.scene_seen().size
+            capture.identity()  # sums the scene while it is in memory: few scenes are
             if min(rows, columns) < SMALLEST_PX:
                 raise AppError(
                     f"{cell.scene}: {rows}x{columns} pixels, needs {SMALLEST_PX}x{SMALLEST_PX} or "
