@@ -1,8 +1,9 @@
 """Films of light fields against the same frames, each reconstructed alone: accuracy, rest, cost.
 
-A window of a light field rests, slides by fractions of a pixel, or a disc of the next light field
-passes before it at another speed and disparity, while it slides ("passes") or rests ("crosses"); of a built-in scene that moves, the
-scene itself, whatever the motion. The exact light field of every frame is known.
+A window of a light field rests or slides by fractions of a pixel. A disc of the next light field
+passes at another speed and disparity before a window that slides ("passes") or rests ("crosses").
+A built-in scene that moves is rendered itself, whatever the motion. The exact light field of every
+frame is known.
 """
 
 from __future__ import annotations

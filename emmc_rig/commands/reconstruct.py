@@ -190,6 +190,10 @@ def _film(capture: Any, out: Path, strict: bool, **given: Any) -> None:
         f"{film['verdicts']['trust']}; worst: frame {worst['frame']} at {worst['time_s']:.1f} s"
         + (f", estimated accuracy {stated}" if stated else "")
     )
+    tell(
+        f"kept from earlier frames, as readings did not change: {film['still_share']:.0%} of the "
+        f"pixels; frames that begin anew: {', '.join(map(str, film['begun_anew'])) or 'none'}"
+    )
     show_verdict(metrics)
     shown = capture.folder if out == capture.own_place else out
     tell(f"emmc-rig export {shown} shows it")

@@ -89,7 +89,8 @@ DAMAGED = (
     ReconstructionError, SensingError,
 )  # fmt: skip
 """Errors of reading a damaged or missing file of an earlier run."""
-FOLLOWS = {"new_share", "moved_px"}
+STILL = "still_share"
+FOLLOWS = {STILL, "moved_px"}
 """Parameters of frames that follow an earlier frame, with masks at rest and stepping masks."""
 FILM_TAKES = "an array (t, pixel_y, pixel_x), or an iterable of Frames of one shot each"
 
@@ -480,6 +481,7 @@ def _metrics(
             "missing": sorted(set(range(count)) - {frame["frame"] for frame in done}),
             "failed": {str(place): why for place, why in failed.items()},
             "begun_anew": anew,
+            "still_share": float(np.mean([frame["parameters"].get(STILL, 0.0) for frame in done])),
             "verdicts": {level: levels[level] for level in LEVELS},
             "trusted_share": levels["trust"] / len(done),
             "seconds_per_frame": took_s / len(done),

@@ -8,11 +8,10 @@ the next frame the same point of a surface meets other cells of the mask: time i
 Nothing carried is believed further than readings go. A reading of an earlier frame counts with the
 variance that what is foretold misses around it, so that where flow is wrong, or something is hidden
 meanwhile, the present frame decides alone. Where readings stay what they were, within their noise,
-the scene rests: nothing is learnt there but less noise, and every fit begins as the first one did,
-as fits that go on from each other drift. Where the carried scene foretells the present frame no
-better than total variation does over more than NEW_SHARE of the picture, it is a first frame. A
-frame with a larger residual beside motion than the first frame's also begins a new film: detail
-finer than the pixels changes as it moves, and nothing carried is right of it.
+the scene rests, and its light field is kept (`resting`). Where the carried scene foretells the
+present frame no better than total variation does over more than NEW_SHARE of the picture, it is a
+first frame. A frame with a larger residual beside motion than the first frame's also begins a new
+film: detail finer than the pixels changes as it moves, and nothing carried is right of it.
 """
 
 from __future__ import annotations
@@ -182,7 +181,7 @@ class Film:
         used = plain.given.usable & ~plain.held
         this = OtherTime(plain.bright, used, plain.picture, still, still)
         kept = (*earlier, this)[-max(self.settings.earlier, self.settings.together) :]
-        rest = Rest.of(result, plain.given.frames, plain.picture)
+        rest = Rest.of(result, plain.given, plain.picture)
         known = Known(plain.scale, margin, rest, texture, centre, beliefs, missed, kept)
         return replace(self, known=known)
 
@@ -334,6 +333,7 @@ def followed(
         parameters={
             "flow_px": float(np.median(np.linalg.norm(there, axis=-1))),
             "new_share": new,
+            "still_share": 0.0,
         },
     )
 

@@ -44,6 +44,7 @@ class Fits:
         with_patches: whether the last model is patches.
         understated: ratio of the variance of these models' mean to what their spread says of it,
             over that ratio for a capture's models.
+        centres: disparity of each model of surfaces, (y, x); empty if one serves for all.
     """
 
     light_fields: list[NDArray[np.uint16]]
@@ -112,7 +113,7 @@ def fitted_models(
     apart, which the prism puts 2 px apart.
 
     on_step: called with the number of steps done. second: beliefs of a second search. others:
-    frames of other times.
+    frames of other times. carried: disparity of the frame before, which the last fit begins with.
     """
     given, bright, held = survey.given, survey.bright, survey.held
     scale, first = np.float32(survey.scale), settings.misfits[0]

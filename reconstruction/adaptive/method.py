@@ -35,7 +35,7 @@ from emmc_rig.reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
 from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
 from emmc_rig.reconstruction.adaptive.film import Film, followed
 from emmc_rig.reconstruction.adaptive.fits import Fits, Patches, averaged, fitted_models
-from emmc_rig.reconstruction.adaptive.resting import WHOLE, Before, Rest, Window, covered, windows
+from emmc_rig.reconstruction.adaptive.resting import WHOLE, Before, Window, covered, windows
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.adaptive.survey import (
     CONTRAST,
@@ -103,11 +103,10 @@ def reconstruct_next(
         return _reconstructed(whole, settings, on_step, film, shown=shown)
     given, edges = _without_edges(whole, settings)
     if film.known is not None and edges is None:
-        rest = film.known.rest
-        changed = rest.changed(given)
+        changed = film.known.rest.changed(given)
         places = windows(changed)
         if covered(places) < WHOLE * changed.size:
-            return _resting(film, rest, given, changed, places, settings, on_step, started)
+            return _resting(film, given, changed, places, settings, on_step, started)
     total = film.settings.texture.steps + 1
 
     def report(step: int) -> None:
@@ -131,7 +130,6 @@ def reconstruct_next(
 
 def _resting(
     film: Film,
-    rest: Rest,
     given: Readings,
     changed: NDArray[np.bool_],
     places: Sequence[Window],
@@ -139,52 +137,61 @@ def _resting(
     on_step: Callable[[Progress], None] | None,
     started: float,
 ) -> Reconstruction:
-    """Return the light field of a frame of a camera at rest: what rests, and what changed anew."""
-    psi, k = given.psi, given.psi.binning
-    settings = settings.model_copy(update={"contrast": CONTRAST * film.known.scale})
-    rest = rest.after(given, changed)
-    if rest.due():
-        whole = _reconstructed(rest.mean(given), settings, None)
-        rest = replace(
-            rest.with_fit(whole, tuple(slice(0, n) for n in rest.fits.shape), k),
-            whole=rest.whole + 1,
-        )
-        places = []
-    mean = rest.mean(given)
-    for rows, columns in places:
-        samples = tuple(slice(at.start * k, at.stop * k) for at in (rows, columns))
-        at = np.s_[:, rows, columns]
-        part = Readings(
-            psi.window(*samples),
-            *(
-                np.ascontiguousarray(each) if isinstance(each, np.ndarray) else each
-                for each in (mean.frames[at], mean.typical, mean.noise[at], mean.usable[at])
-            ),
-        )
-        before = Before(
-            rest.picture[samples],
-            rest.disparity[samples],
-            of_samples(changed[rows, columns], rest.disparity[samples]),
-        )
-        rest = rest.with_fit(
-            _reconstructed(part, settings, None, before=before), (rows, columns), k
-        )
+    """Return the light field of a frame of a camera at rest: only what changed is fitted.
+
+    changed: (pixel_y, pixel_x), within the windows `places`.
+    """
+    known, psi, k = film.known, given.psi, given.psi.binning
+    assert known is not None
+    settings = settings.model_copy(update={"contrast": CONTRAST * known.scale})
+    rest = known.rest.after(given, changed)
+    mean, everything = rest.mean(given), (slice(0, changed.shape[0]), slice(0, changed.shape[1]))
+    due = rest.due()
+    if due:
+        places = [everything]
+    steps = 0
+    for number, window in enumerate(places):
+        rows, columns = (slice(at.start * k, at.stop * k) for at in window)
+        part, at = mean, (slice(None), *window)
+        if not due:
+            part = Readings(
+                psi.window(rows, columns),
+                np.ascontiguousarray(mean.frames[at]),
+                mean.typical,
+                np.ascontiguousarray(mean.noise[at]),
+                np.ascontiguousarray(mean.usable[at]),
+            )
+        disparity = rest.disparity[rows, columns]
+        seen = rest.picture[rows, columns]
+        before = Before(seen, disparity, of_samples(changed[window], disparity))
+
+        def report(of: Progress, number: int = number) -> None:
+            if on_step is not None:
+                total = of.total or of.step
+                done = number * total + of.step
+                on_step(Progress(done, None, None, len(places) * total))
+
+        found = _reconstructed(part, settings, report, before=None if due else before)
+        rest, steps = rest.with_fit(found, window, k), steps + found.steps
+    rest = replace(rest, whole=rest.whole + due)
     light_field = mixture.values(rest.light_field)
     residual = (given.frames - psi.forward(light_field)).astype(np.float32)
     figures = dict(rest.figures)
     figures |= misfit(residual, given.noise, given.usable)
     figures |= {"still_share": float(1 - changed.mean())}
+    if on_step is not None and not places:
+        on_step(Progress(1, None, None, 1))
     return Reconstruction(
         method="adaptive",
         light_field=light_field,
         status=Status.CONVERGED,
         advice="",
-        steps=1,
+        steps=steps,
         objective=(),
         seconds=running_s() - started,
         parameters=figures,
         maps=rest.maps,
-        film=replace(film, known=replace(film.known, rest=rest)),
+        film=replace(film, known=replace(known, rest=rest)),
     )
 
 
@@ -221,6 +228,7 @@ def _reconstructed(
     """Return the light field of a frame.
 
     shown: frames of other times, see `others_of`. known: disparity of the centre view (y, x).
+    before: what the place showed in the frame before, of a place where something changed.
     """
     started = running_s()
     searched_s = 0.0
@@ -251,7 +259,7 @@ def _reconstructed(
     result = _result_of(survey, fits, survey.volume, beliefs, edges, whole, total, started)
     report(total)
     if before is not None:
-        result = replace(result, maps=result.maps | {"picture": survey.picture})
+        result = replace(result, maps={**result.maps, "picture": survey.picture})
     left = result.parameters["misfit"]
     of_others = moved(others) if others else {}
     return replace(

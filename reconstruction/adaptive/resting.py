@@ -1,14 +1,14 @@
 """What rests before a camera at rest keeps its light field; only what changed is fitted anew.
 
-A reading is the sum over its pixel's rays, I = sum_r w_r L_r. As long as it differs from the mean
-of the readings before by no more than noise (`changed`), its rays are what they were, whichever
-surfaces they see: rest is decided pixel by pixel, without flow or disparity. Before a mask at rest
-n frames of such a pixel are n times the same equation: their mean has the n-th part of the noise.
+A reading is the sum over its pixel's rays, I = sum_r w_r L_r. A pixel rests while its reading
+differs from the mean of earlier readings by no more than noise (`changed`). Its rays have then not
+changed; flow and disparity play no part in that decision. Behind a mask at rest n frames of
+such a pixel are n times the same equation: their mean has the n-th part of the noise's variance.
 
 Windows around what changed are fitted as captures of their own (`windows`): the present readings
-where they changed, means elsewhere. Each also sees resting pixels anew, beside other neighbours and
-other patches: the fits of a resting pixel are averaged. After REFITTED, REFITTED^2 ... frames the
-means of all readings are fitted as one more capture.
+where they changed, means elsewhere. The resting pixels of a window are
+fitted again, too, and the fits of a resting pixel are averaged. When pixels have rested for
+REFITTED, REFITTED^2 ... frames, the means of all readings are fitted as one more capture.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from emmc_rig.reconstruction.adaptive import mixture
 from emmc_rig.reconstruction.adaptive.times import at_places, flow_between, of_samples, sampled
 from emmc_rig.reconstruction.inputs import Readings
-from emmc_rig.reconstruction.result import Reconstruction
+from emmc_rig.reconstruction.result import SCALE, TAILS, WITHIN, Reconstruction
 
 Array = NDArray[np.floating]
 Window = tuple[slice, slice]
@@ -33,17 +33,19 @@ MOST, CHANGED = 8.0, {1.2: 3.2, 3.0: 1.5, 6.0: 1.25}
 deviations, pixels; and the means from which on a pixel changed. Wider windows leave out what
 changed by narrower ones."""
 CLOSED_PX = 9
-"""Gaps in what changed that are filled."""
+"""Width of gaps between changed pixels that count as changed."""
 WHOLE = 0.8
 """Share of the picture that windows cover from which on nothing rests. Films of group A (96x128,
 `benchmarks/films.py`): 0.4 to 0.6 while a disc passes before a scene at rest, 0.7 of `moving-toys`,
 1 while the camera moves by a pixel a frame."""
 AROUND_PX, LEAST_PX, BORDER_PX = 5, 36, 3
-"""Pixels around what changed that are fitted with it; least side of a window; pixels at a window's
-border whose fit is not used."""
+"""Resting pixels around changed ones that a window includes. A window's least side. Pixels at a
+window's border whose fit is not used."""
 REFITTED = 4
 LONGEST = 8
 """Fits that are averaged, about."""
+BY_AREA = TAILS, WITHIN, SCALE, "decided", "over_plain"
+"""Figures of a frame that are means over its fits, weighted by the area where each is used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +55,12 @@ class Rest:
     Attributes:
         light_field: mean of the fits, as `mixture.stored`.
         disparity, disparity_sigma, texture, sigma: maps of the latest fit.
-        readings: mean of the readings, (1, pixel_y, pixel_x).
-        count: of readings in the mean, (pixel_y, pixel_x).
-        fits: number in the mean of light fields, (pixel_y, pixel_x).
+        picture: centre view of the latest light field without surfaces, (y, x, c).
+        readings: mean of the usable readings, (1, pixel_y, pixel_x).
+        count: number of readings in the mean, (pixel_y, pixel_x).
+        fits: number of fits in the mean of light fields, (pixel_y, pixel_x).
         whole: number of fits of the whole picture.
-        figures: parameters of the latest one.
+        figures: parameters of the latest fit of the whole picture, those of `BY_AREA` averaged.
     """
 
     light_field: NDArray[np.uint16]
@@ -73,9 +76,8 @@ class Rest:
     figures: tuple[tuple[str, float], ...]
 
     @classmethod
-    def of(cls, result: Reconstruction, readings: Array, picture) -> Rest:
+    def of(cls, result: Reconstruction, given: Readings, picture: Array) -> Rest:
         """Return what a frame leaves that was fitted as a whole."""
-        once = np.ones(readings.shape[1:], dtype=np.float32)
         sigma = result.maps.get("sigma", np.empty((0, 0, 0, 0)))
         return cls(
             light_field=mixture.stored(result.light_field),
@@ -84,9 +86,9 @@ class Rest:
             texture=result.maps["texture"],
             sigma=sigma.astype(np.float16),
             picture=picture,
-            readings=readings,
-            count=once,
-            fits=once,
+            readings=given.frames,
+            count=given.usable[0].astype(np.float32),
+            fits=np.ones(given.frames.shape[1:], dtype=np.float32),
             whole=1,
             figures=tuple((name, float(value)) for name, value in result.parameters.items()),
         )
@@ -96,10 +98,14 @@ class Rest:
 
         The noise of bright readings is that of photons at most, whatever their mean deviation.
         """
-        weight = given.usable[0].astype(np.float32)
-        mean = max(float(self.readings[given.usable].mean()), 1e-20)
-        variance = given.noise[0] * (1 + 1 / self.count) * np.maximum(self.readings[0] / mean, 1)
-        square = np.minimum(np.square(given.frames - self.readings)[0] / variance, MOST)
+        known = given.usable[0] & (self.count > 0)
+        if not known.any():
+            return np.ones_like(known)
+        weight = known.astype(np.float32)
+        relative = self.readings[0] / max(float(self.readings[0][known].mean()), 1e-20)
+        variance = given.noise[0] * (1 + 1 / np.maximum(self.count, 1)) * np.maximum(relative, 1)
+        square = np.square(given.frames - self.readings)[0] / np.maximum(variance, 1e-20)
+        square = np.minimum(square, MOST)
         changed = np.zeros(weight.shape, np.uint8)
         closing = np.ones((CLOSED_PX, CLOSED_PX), np.uint8)
         for window_px, limit in CHANGED.items():
@@ -114,24 +120,25 @@ class Rest:
         return cv2.drawContours(changed, outlines, -1, 1, cv2.FILLED) > 0
 
     def after(self, given: Readings, changed: NDArray[np.bool_]) -> Rest:
-        """Return it with the readings of one more frame; where they changed a mean begins."""
-        count = np.where(changed, np.float32(1), self.count + 1)
-        readings = self.readings + (given.frames - self.readings) / count
+        """Return the state with one more frame's readings; a mean begins where they changed."""
+        used = given.usable[0].astype(np.float32)
+        count = np.where(changed, 0, self.count) + used
+        readings = self.readings + used * (given.frames - self.readings) / np.maximum(count, 1)
         return replace(self, readings=readings, count=count, fits=np.where(changed, 0, self.fits))
 
     def mean(self, given: Readings) -> Readings:
         """Return the mean readings with their noise; given: of the present frame."""
-        noise = (given.noise / self.count).astype(np.float32)
-        typical = float(np.sqrt(noise.mean()))
-        return replace(given, frames=self.readings, noise=noise, typical=typical)
+        noise = (given.noise / np.maximum(self.count, 1)).astype(np.float32)
+        typical, usable = float(np.sqrt(noise.mean())), (self.count > 0)[None]
+        return Readings(given.psi, self.readings, typical, noise, usable)
 
     def due(self) -> bool:
         """Return whether the whole picture is to be fitted again."""
         return float(np.median(self.count)) >= REFITTED**self.whole
 
     def with_fit(self, found: Reconstruction, window: Window, binning: int) -> Rest:
-        """Return it with one more fit of a window of pixels, averaged where it rests."""
-        new, rows, columns = np.zeros(self.fits.shape, bool), *window
+        """Return the state with one more fit of a window of pixels, averaged where they rest."""
+        new = np.zeros(self.fits.shape, bool)
         ends = [
             slice(
                 at.start + BORDER_PX * (at.start > 0),
@@ -161,7 +168,18 @@ class Rest:
             maps["picture"][samples] = found.maps["picture"]
         fits = self.fits.copy()
         fits[window] += part
-        return replace(self, light_field=light_field, sigma=sigma, fits=fits, **maps)
+        area, figures = float(new.mean()), dict(self.figures)
+        for name in BY_AREA:
+            if name in figures and name in found.parameters:
+                figures[name] += area * (float(found.parameters[name]) - figures[name])
+        return replace(
+            self,
+            light_field=light_field,
+            sigma=sigma,
+            fits=fits,
+            figures=tuple(figures.items()),
+            **maps,
+        )
 
     @property
     def maps(self) -> dict[str, NDArray]:
@@ -175,14 +193,21 @@ class Rest:
 
 
 class Before(NamedTuple):
+    """What a window showed in the frame before.
+
+    Attributes:
+        picture: centre view of the light field without surfaces, (y, x, c).
+        disparity: of the centre view, (y, x).
+        changed: where readings changed since, (y, x).
+    """
+
     picture: Array
     disparity: Array
     changed: NDArray[np.bool_]
 
-    def carried(self, picture) -> Array:
+    def carried(self, picture: Array) -> Array:
         """Return the disparity of the frame before, carried to the present picture."""
-        there, back = flow_between(self.picture, picture)
-        back = back * self.changed[..., None]
+        back = flow_between(self.picture, picture)[1] * self.changed[..., None]
         return sampled(self.disparity, at_places(back.shape[:2]) + back)
 
 
@@ -193,10 +218,8 @@ def windows(changed: NDArray[np.bool_]) -> list[Window]:
     while True:
         found, before = [], around.copy()
         for left, top, wide, high, _ in cv2.connectedComponentsWithStats(around)[2][1:]:
-            window = tuple(
-                _least(at, length, whole)
-                for at, length, whole in zip((top, left), (high, wide), changed.shape, strict=True)
-            )
+            rows, columns = changed.shape
+            window = _least(top, high, rows), _least(left, wide, columns)
             around[window] = 1
             found.append(window)
         if np.array_equal(around, before):
