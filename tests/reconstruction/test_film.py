@@ -10,6 +10,7 @@ from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.adaptive.film import Film
 from emmc_rig.reconstruction.adaptive.joint import surfaces_of
+from emmc_rig.reconstruction.adaptive.survey import checked
 from emmc_rig.reconstruction.adaptive.times import (
     OtherTime,
     at_places,
@@ -188,35 +189,99 @@ def test_a_frame_that_earlier_ones_mislead_is_a_first_one(psi, followed):
     assert found.film.known.missed == easier.known.missed
 
 
-def test_what_rests_has_no_flow(psi):
-    film = Film()
-    for seed in (1, 2):
-        shown = _readings(psi, _sliding(0), seed)
-        result = reconstruct("adaptive-fast", psi, shown, film=film)
+SHOWN = np.s_[:, :, 36:42, 50:56]
+"""Where an object appears before a scene that rests."""
+
+
+@pytest.fixture(scope="module")
+def resting(psi):
+    """Return the truths and results of a resting scene before which an object appears at last."""
+    truth, film, out = render("toy-table", (5, 5), SIZE).light_field, Film(), []
+    changed = truth.copy()
+    changed[SHOWN] = 1 - truth[SHOWN]
+    for frame, seen in enumerate((truth, truth, changed, changed)):
+        steps = []
+        result = reconstruct(
+            "adaptive-fast", psi, _readings(psi, seen, frame), film=film, on_step=steps.append
+        )
         film = result.film
-    assert result.parameters["flow_px"] < 0.1
-    assert result.parameters["still_share"] > 0.95
+        out.append((seen, result, steps))
+    return out
 
 
-def test_nothing_drifts_where_the_scene_rests(psi):
-    film, truth = Film(), render("toy-table", (5, 5), SIZE).light_field
-    moved, found = truth.copy(), []
-    moved[:, :, 36:42, 50:56] = 1 - truth[:, :, 36:42, 50:56]
-    for frame, seen in enumerate((truth, truth, truth, moved)):
-        shown = _readings(psi, seen, frame)
-        film = reconstruct("adaptive-fast", psi, shown, film=film).film
-        found.append(film.known)
-    first, second, third, last = found
-    still = np.s_[:, :, :20, :24]
-    for known in (second, third, last):
-        assert np.array_equal(known.rest.first[still], first.rest.first[still])
-        assert np.array_equal(known.centre[: 20 + known.margin], first.centre[: 20 + first.margin])
-    # The average over its frames has less noise, and what moved is as the last frame shows it.
-    noise = [np.std(known.rest.mean[still] - 65535.0 * truth[still]) for known in (first, third)]
-    assert noise[1] < noise[0]
-    changed = np.s_[:, :, 37:41, 51:55]
-    assert not (last.rest.first[changed] == first.rest.first[changed]).any()
-    assert last.rest.count == 4
+def test_a_resting_scene_is_not_fitted_again_and_stays_what_it_was(resting):
+    (_, first, _), (_, second, steps) = resting[:2]
+    assert second.parameters["still_share"] > 0.95
+    assert second.steps == 0
+    assert [(step.step, step.total) for step in steps] == [(1, 1)]
+    np.testing.assert_allclose(second.light_field, first.light_field, atol=1 / 65535)
+    assert np.array_equal(second.maps["disparity"], first.maps["disparity"])
+
+
+def test_readings_of_resting_places_are_averaged(psi, resting):
+    truth, result, _ = resting[1]
+    rest = result.film.known.rest
+    shown = [_readings(psi, truth, frame) for frame in range(2)]
+    mean = np.mean([frame.readings for frame in shown], axis=0)
+    rests = (rest.count == 2)[None]
+    assert rests.mean() > 0.95
+    given = checked(psi, replace(shown[1], readings=mean))
+    np.testing.assert_allclose(rest.readings[rests], given.frames[rests], atol=1e-6)
+    np.testing.assert_allclose(rest.mean(given).noise[rests], given.noise[rests] / 2, rtol=1e-5)
+
+
+def test_the_mean_of_readings_is_fitted_after_frames_at_rest(psi):
+    truth, film, found = render("near-planar", (5, 5), SIZE).light_field, Film(), []
+    rng, exact = np.random.default_rng(0), psi.forward(truth)
+    for _ in range(5):
+        noisy = exact + rng.normal(0, 0.02, exact.shape).astype(np.float32)
+        result = reconstruct("adaptive-fast", psi, even_frames(noisy, 0.02), film=film)
+        film = result.film
+        found.append(result)
+    assert [result.steps > 0 for result in found] == [True, False, False, True, False]
+    before_db, after_db = (psnr_db(found[n].light_field, truth) for n in (2, 3))
+    assert after_db > before_db + LEAST_GAIN_DB
+
+
+def test_of_an_object_before_a_resting_scene_only_its_surroundings_are_fitted(resting):
+    (_, before, _), (truth, last, steps) = resting[1:3]
+    rest = last.film.known.rest
+    object_px = rest.count[SHOWN[2:]]
+    assert (object_px == 1).all(), "all pixels of the object are found to have changed"
+    assert 0.5 < last.parameters["still_share"] < 1
+    fitted = (last.light_field != before.light_field).any(axis=(0, 1, 4))
+    assert fitted[SHOWN[2:]].all()
+    assert fitted.mean() < 0.5
+    far = np.s_[:, :, :, :20]
+    assert np.array_equal(last.light_field[far], before.light_field[far])
+    was, now = (np.abs(of.light_field - truth)[SHOWN].mean() for of in (before, last))
+    assert now < 0.5 * was
+    assert [step.step for step in steps] == sorted(step.step for step in steps)
+    assert steps[-1].step == steps[-1].total
+
+
+def test_an_object_that_stays_rests_in_the_next_frame(resting):
+    assert resting[3][1].parameters["still_share"] > 0.95
+    assert (resting[3][1].film.known.rest.count[SHOWN[2:]] == 2).mean() > 0.9
+
+
+def test_a_pixel_without_a_reading_rests_on_its_earlier_ones(psi, resting):
+    truth, first, _ = resting[0]
+    shown = _readings(psi, truth, 7)
+    usable = shown.usable.copy()
+    usable[:, 10:14, 10:14] = False
+    readings = np.where(usable, shown.readings, 1)
+    given = replace(shown, readings=readings, usable=usable)
+    rest = reconstruct("adaptive-fast", psi, given, film=first.film).film.known.rest
+    assert (rest.count[10:14, 10:14] == 1).all()
+    before = first.film.known.rest
+    assert np.array_equal(rest.readings[:, 10:14, 10:14], before.readings[:, 10:14, 10:14])
+
+
+def test_the_psnr_of_resting_frames_lies_in_the_interval_stated(resting):
+    for truth, result, _ in resting:
+        low, high = result.stated["stated_interval_db"]
+        assert low <= psnr_db(result.light_field, truth) <= high
 
 
 def test_a_camera_that_moves_sees_nothing_rest(followed):
