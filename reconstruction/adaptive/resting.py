@@ -44,7 +44,7 @@ window's border whose fit is not used."""
 REFITTED = 4
 LONGEST = 8
 """Fits that are averaged, about."""
-BY_AREA = TAILS, WITHIN, SCALE, "decided", "over_plain"
+BY_AREA = WITHIN, SCALE, "decided", "over_plain"
 """Figures of a frame that are means over its fits, weighted by the area where each is used."""
 
 
@@ -161,14 +161,19 @@ class Rest:
         for name in ("disparity", "disparity_sigma", "texture"):
             maps[name] = getattr(self, name).copy()
             maps[name][samples][chosen] = found.maps[name][chosen]
+        figures = dict(self.figures)
         if sigma.size and "sigma" in found.maps:
-            sigma[at][..., chosen] = found.maps["sigma"][..., chosen]
+            # The PSNR stated is then that of the mean square error of all parts.
+            more_db = found.parameters.get(TAILS, 0.0) - figures.get(TAILS, 0.0)
+            own = np.square(found.maps["sigma"]) * np.float32(10 ** (more_db / 10))
+            variance = np.square(sigma[at], dtype=np.float32)
+            sigma[at] = np.sqrt(variance + share * (own - variance))
         if "picture" in found.maps:
             maps["picture"] = self.picture.copy()
             maps["picture"][samples] = found.maps["picture"]
         fits = self.fits.copy()
         fits[window] += part
-        area, figures = float(new.mean()), dict(self.figures)
+        area = float(new.mean())
         for name in BY_AREA:
             if name in figures and name in found.parameters:
                 figures[name] += area * (float(found.parameters[name]) - figures[name])

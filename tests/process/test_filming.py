@@ -133,7 +133,7 @@ def test_every_frame_has_its_result_at_its_time(session, whole):
         verdicts.append(metrics["verdict"]["level"])
         assert metrics["frame"] == place
         assert frame.light_field.shape == (5, 5, 40, 48, 3)
-        assert ("new_share" in metrics["parameters"]) == (place not in {0, *about["begun_anew"]})
+        assert ("still_share" in metrics["parameters"]) == (place not in {0, *about["begun_anew"]})
     assert about["verdicts"] == about["verdicts"] | {
         level: verdicts.count(level) for level in verdicts
     }
@@ -249,6 +249,23 @@ def test_a_missing_frame_keeps_its_place_and_the_next_goes_on_from_the_one_befor
     np.testing.assert_allclose(film.times_s, np.arange(FRAMES) / RATE, atol=1e-6)
 
 
+def test_frames_that_rest_follow_and_one_of_another_scene_begins_anew(
+    session, tmp_path, monkeypatch
+):
+    first = []
+
+    def rests_then_mirrored(place, frames):
+        first.append(frames)
+        shown = first[0].readings
+        return replace(frames, readings=shown if place < 3 else shown[:, ::-1, ::-1])
+
+    changed_frames(monkeypatch, rests_then_mirrored)
+    reconstructed(session, tmp_path / "out", METHOD)
+    about = film_metrics(tmp_path / "out")
+    assert about["begun_anew"] == [3]
+    assert about["still_share"] == pytest.approx(4 / FRAMES, abs=0.02)
+
+
 def test_a_frame_without_usable_pixels_is_named_and_the_others_are_made(
     session, tmp_path, monkeypatch
 ):
@@ -291,6 +308,9 @@ def test_the_command_says_how_a_film_went_and_where_it_is_worst(session, run):
     about = film_metrics(copy / "reconstruction")
     assert f"{FRAMES} of {FRAMES} frames in" in out
     assert f"trusted: {about['verdicts']['trust']}; worst: frame {about['worst']['frame']}" in out
+    anew = ", ".join(map(str, about["begun_anew"])) or "none"
+    kept = f"{about['still_share']:.0%} of the pixels; frames that begin anew: {anew}"
+    assert kept in " ".join(out.split())
     assert not list((copy / "reconstruction").rglob("*.png"))
 
 
@@ -491,7 +511,9 @@ def test_what_is_no_film_is_refused(psi, wrong):
 )
 def test_settings_of_films_reach_the_frames_after_the_first(psi, steps, changed):
     masks = psi if steps else psi.of_shots([0])
-    given = masks, readings(masks, 3, step=0), METHOD
+    # At rest no frame is fitted with earlier ones.
+    step = 0 if steps or "segment" in changed else 1
+    given = masks, readings(masks, 3, step), METHOD
     usual, other = (
         [
             result.light_field
@@ -562,3 +584,19 @@ def test_a_film_restored_goes_on_as_the_film_it_was_of(psi):
     known = latest.film.known
     assert known is not None
     assert len(latest.shots) == len(known.earlier)
+
+
+def test_a_film_at_rest_restored_goes_on_as_the_film_it_was_of(psi):
+    of_shot, latest, settings = psi.of_shots([0]), filming.Latest(), MethodSettings()
+    film = readings(of_shot, 6, step=0)
+    film[2:, 8:14, 8:14] = film[2:, 8:14, 8:14][:, ::-1, ::-1]
+    for part in film:
+        frames = of_readings(part)
+        restored = Film.restored(latest.film.arrays(), [of_shot] * len(latest.shots))
+        again, _ = replace(latest, film=restored).next(of_shot, 0, frames, METHOD, settings)
+        result, latest = latest.next(of_shot, 0, frames, METHOD, settings)
+        np.testing.assert_array_equal(result.light_field, again.light_field)
+        assert result.solved.stated == again.solved.stated
+        for name, values in result.maps.items():
+            np.testing.assert_array_equal(values, again.maps[name])
+    assert result.solved.parameters["still_share"] > 0.9
