@@ -43,8 +43,8 @@ LARS_GAP = 0.05
 """A path that ends further from the minimiser went wrong by rounding: status not converged."""
 FIRST_STEPS = 20
 """Steps of ADMM on all atoms, which determine the working set."""
-WHOLE = 8
-"""Atoms per measurement up to which ADMM needs no working set."""
+FEW, FIRST_STEPS_OF_FEW = 8, 60
+"""Atoms per measurement up to which a working set saves little, and the steps on all atoms then."""
 INNER_SHARE = 0.5
 """Share of the tolerance to which ADMM solves a working set."""
 DEPENDENT = 1e-3
@@ -284,7 +284,8 @@ def _largest(values: Array, wanted: int) -> NDArray[np.bool_]:
 class _Admm(_Minimiser):
     """ADMM on a growing working set S; `bpdn_kernels.split` shows the mathematics of its steps.
 
-    Begin: FIRST_STEPS steps on all atoms from w = 0; S = the 2 m largest |w_j| of m measurements.
+    Begin: FIRST_STEPS steps on all atoms, or FIRST_STEPS_OF_FEW on few, from w = 0; S = the 2 m
+    largest |w_j| of m measurements.
     Step:
         w_S = ADMM on the atoms of S alone, from w_S, to a gap of `inner`
         r   = its dual point, g_j = |a_j . r| over all atoms
@@ -297,8 +298,8 @@ class _Admm(_Minimiser):
         self.inner = INNER_SHARE * self.settings.rtol
         self.w = np.zeros(len(self.atoms), np.float32)
         self.dual_point = np.empty(len(self.data), np.float32)
-        few = len(self.atoms) <= WHOLE * len(self.data)
-        first = self.settings.max_steps if few else min(self.settings.max_steps, FIRST_STEPS)
+        few = len(self.atoms) <= FEW * len(self.data)
+        first = min(self.settings.max_steps, FIRST_STEPS_OF_FEW if few else FIRST_STEPS)
         run = self._split(self.atoms, self.sensed.inverse, self.settings.rtol, first, self.w)
         self.steps, self.gap = float(run.steps), run.gap
         self.working = _largest(np.abs(self.w), 2 * len(self.data))

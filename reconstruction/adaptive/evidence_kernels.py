@@ -68,8 +68,8 @@ class Hypotheses(NamedTuple):
         chromas: of kinds, variance of a chrominance over that of luminance, (kind,).
         trials: length, probe and rank of the kinds to try, in order, (trial, 3).
         freedom: degrees of the Student t.
-        shared: textures whose covariances all patches share, since Psi is the same at every pixel;
-            none where each patch has its own.
+        shared: textures whose covariances all patches share, if Psi is the same at every pixel;
+            empty if Psi differs.
     """
 
     weights: Any

@@ -138,11 +138,14 @@ def test_the_patches_of_adaptive_cut_no_pixel_and_leave_no_gap(random_psi, binni
 
 
 @pytest.mark.parametrize(
-    ("shots", "binning", "side"),
-    [(1, 1, 9), (2, 1, 6), (6, 1, 6), (9, 1, 4), (60, 1, 4), (3, 2, 8)],
-)
-def test_patches_of_several_shots_are_smaller(shots, binning, side):
-    assert usual_patch(binning, shots) == (side, side)
+    ("shots", "binning", "views", "side"),
+    [
+        (1, 1, 5, 9), (2, 1, 5, 6), (6, 1, 5, 6), (9, 1, 5, 5), (60, 1, 5, 4), (3, 2, 5, 8),
+        (3, 1, 8, 9), (6, 1, 8, 6), (3, 1, 3, 6),
+    ],
+)  # fmt: skip
+def test_patches_of_several_shots_are_smaller_and_of_many_views_larger(shots, binning, views, side):
+    assert usual_patch(binning, shots, (views, views)) == (side, side)
 
 
 def test_settings_of_version_0_2_open_with_a_warning_for_what_is_gone():
