@@ -40,7 +40,7 @@ HIDDEN, PATCHES_CHANCE = 1.2, 0.25
 disparity errs in both directions among the rays of a pixel. Of buttercup, dice, fish and
 deep-occlusions, three shots, 0.9 to 1.5. And the weight of patches where both errors are noise: in
 antinous they are 2 dB worse there. Group A, 96x96, two to six shots: a chance of 1 loses 0.1 dB in
-the mean (antinous 1.0), 0.1 loses 0.03 (buttercup 0.2); HIDDEN 1 loses 0.02, 1.5 0.02."""
+the mean (antinous 1.0), 0.1 loses 0.03 (buttercup 0.2); HIDDEN 1 loses 0.02, 1.5 0.04."""
 LEVELS = 65535
 """Number of steps of stored values in [0, 1]."""
 
