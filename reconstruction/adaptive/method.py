@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -58,6 +59,9 @@ from emmc_rig.reconstruction.inputs import Readings
 from emmc_rig.reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
 Array = NDArray[np.floating]
+_converged = partial(
+    Reconstruction, method="adaptive", status=Status.CONVERGED, advice="", objective=()
+)
 TEXTURED = 0.01
 """Variance of a patch's texture, over its squared brightness, from which it counts as textured. On
 middles of group A (96x96, one CFA shot) 11 to 100 % of such patches decide, of weaker ones 0 to
@@ -181,13 +185,9 @@ def _resting(
     figures |= {"still_share": float(1 - changed.mean())}
     if on_step is not None and not places:
         on_step(Progress(1, None, None, 1))
-    return Reconstruction(
-        method="adaptive",
+    return _converged(
         light_field=light_field,
-        status=Status.CONVERGED,
-        advice="",
         steps=steps,
-        objective=(),
         seconds=running_s() - started,
         parameters=figures,
         maps=rest.maps,
@@ -313,13 +313,9 @@ def _result_of(
     if edges is not None:
         light_field = faded(edges, psi, light_field, whole.frames, whole.usable)
     decided = _decided(searched)
-    return Reconstruction(
-        method="adaptive",
+    return _converged(
         light_field=light_field,
-        status=Status.CONVERGED,
-        advice="",
         steps=steps,
-        objective=(),
         seconds=running_s() - started,
         parameters={
             "noise_sigma": given.typical,
