@@ -194,10 +194,8 @@ class _Coder:
         fitting = max(1, int(BATCH_BYTES // (4 * len(self.atoms) * (measurements + 8))))
         for colours, patches in self._colour_groups():
             if colours is None:
-                sets, set_of_shot = (
-                    [selected_atoms(self.atoms, None, self.psi.binning)],
-                    [0] * self.psi.shots,
-                )
+                sets = [selected_atoms(self.atoms, None, self.psi.binning)]
+                set_of_shot = [0] * self.psi.shots
             else:
                 shots = list(_grouped(of_shot.tobytes() for of_shot in colours).values())
                 sets = [

@@ -25,11 +25,12 @@ from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
 from emmc_rig.reconstruction.adaptive.settings import SIDES, Side
 from emmc_rig.reconstruction.adaptive.survey import contrast_of
-from emmc_rig.reconstruction.dictionary import Dictionary, usual_patch
+from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import check_frames
 from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.methods import MethodSettings, find_method, reconstruct
+from emmc_rig.reconstruction.methods.surfaces import patch_of
 from emmc_rig.reconstruction.methods.variational import patched_weights
 from emmc_rig.reconstruction.problem import choose_mu, choose_primal_step, contrast, smooth_guess
 from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
@@ -358,8 +359,7 @@ def surveyed(
         settings = settings.model_copy(update={"adaptive": adaptive})
     if dictionary is not None:
         halo = max(halo, *dictionary.patch_shape[2:4])
-    own = usual_patch(psi.binning, psi.shots, psi.views)
-    patch = own if dictionary is None else dictionary.patch_shape[2:4]
+    patch = patch_of(sample.psi) if dictionary is None else dictionary.patch_shape[2:4]
     settled = _settled(sample.psi, sample.frames, settings, sparse, patch)
     return CaptureSurvey(settled, halo, left_out, gains, words, largest_px)
 

@@ -6,9 +6,9 @@ changed; flow and disparity play no part in that decision. Behind a mask at rest
 such a pixel are n times the same equation: their mean has the n-th part of the noise's variance.
 
 Windows around what changed are fitted as captures of their own (`windows`): the present readings
-where they changed, means elsewhere. The resting pixels of a window are
-fitted again, too, and the fits of a resting pixel are averaged. When pixels have rested for
-REFITTED, REFITTED^2 ... frames, the means of all readings are fitted as one more capture.
+where they changed, means elsewhere. The resting pixels of a window are fitted again, too, and the
+fits of a resting pixel are averaged. When pixels have rested for REFITTED, REFITTED^2 ... frames,
+the means of all readings are fitted as one more capture.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ AROUND_PX, LEAST_PX, BORDER_PX = 5, 36, 3
 """Resting pixels around changed ones that a window includes. A window's least side. Pixels at a
 window's border whose fit is not used."""
 REFITTED = 4
+"""Frames of rest after which the means of all readings are fitted; each time so many times more."""
 LONGEST = 8
 """Fits that are averaged, about."""
 BY_AREA = WITHIN, SCALE, "decided", "over_plain"
