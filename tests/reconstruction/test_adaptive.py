@@ -135,7 +135,9 @@ def test_patches_behind_a_coded_aperture_share_covariances(random_psi, monkeypat
     evaluated = np.isfinite(single.log_likelihood)
     np.testing.assert_array_equal(np.isfinite(shared.log_likelihood), evaluated)
     # What is not usable adds the same to all disparities of a patch.
-    shift = np.where(evaluated, shared.log_likelihood - single.log_likelihood, np.nan)
+    assert not evaluated.all()
+    shift = np.full(evaluated.shape, np.nan)
+    shift[evaluated] = shared.log_likelihood[evaluated] - single.log_likelihood[evaluated]
     assert np.nanmax(np.nanmax(shift, axis=1) - np.nanmin(shift, axis=1)) < 0.02
 
 
