@@ -45,6 +45,12 @@ FIRST_STEPS = 20
 """Steps of ADMM on all atoms, which determine the working set."""
 FEW, FIRST_STEPS_OF_FEW = 8, 60
 """Atoms per measurement up to which a working set saves little, and the steps on all atoms then."""
+FEWEST_TOGETHER = 8
+"""Patches from which ADMM on all atoms at once, by products of matrices, is the faster."""
+CHECKED = 5
+"""Number of steps between tests of which patches have converged."""
+STEPS_TOGETHER = 100
+"""Steps on all atoms, of many patches together; what is left is solved patch by patch."""
 INNER_SHARE = 0.5
 """Share of the tolerance to which ADMM solves a working set."""
 DEPENDENT = 1e-3
@@ -111,6 +117,14 @@ class Code:
     gap: float = np.nan
 
 
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """ADMM after some steps on all atoms: its state w, (atom,), and how many steps these were."""
+
+    state: Array32
+    steps: float
+
+
 EMPTY = Code(np.zeros(0, np.float32), 0.0, True)
 """Of a patch without a usable reading."""
 
@@ -128,16 +142,16 @@ class SensedDictionary:
     noise_sigma: float
     settings: BPDNSettings
 
-    def code(self, data: Array32, measured: int) -> Code:
+    def code(self, data: Array32, measured: int, begun: Begun | None = None) -> Code:
         """Return the code of a patch: begin, then step until done or at the step limit.
 
-        data: (padded measurement,). measured: how many of its readings are usable. Raises
-        ReconstructionError where A A^T + rho 1 is singular.
+        data: (padded measurement,). measured: how many of its readings are usable. begun: for
+        `admm`, to go on from. Raises ReconstructionError where A A^T + rho 1 is singular.
         """
         kind = SOLVERS[self.settings.method]
         if issubclass(kind, _Minimiser) and not self.typical_norm * self.typical_data > 0:
             return Code(np.zeros(len(self.atoms), np.float32), 0, True)
-        solver = kind(self, data, measured)
+        solver = kind(self, data, measured) if begun is None else _Admm(self, data, measured, begun)
         while not solver.done and solver.steps < solver.most_steps:
             solver.step()
         return solver.result()
@@ -158,17 +172,9 @@ class SensedDictionary:
         return float(np.sqrt(np.mean(np.sum(np.square(self.data, dtype=np.float64), axis=1))))
 
     def penalty(self, data: Array32) -> float:
-        """Return eta of a patch: as set, or c sigma |a| sqrt(2 log n) of n atoms.
-
-        The second is the largest correlation that noise alone reaches (Donoho and Johnstone 1994
-        for the form). Never below a small share of |I| |a|.
-        """
-        settings, count = self.settings, len(self.atoms)
-        if settings.penalty is not None:
-            return settings.penalty
-        universal = self.noise_sigma * self.typical_norm * np.sqrt(2 * np.log(max(count, 2)))
-        smallest = settings.smallest_penalty * self.typical_norm * float(np.linalg.norm(data))
-        return max(settings.penalty_factor * universal, smallest)
+        """Return eta of a patch."""
+        size = float(np.linalg.norm(data))
+        return float(_penalty(self.settings, self.noise_sigma, len(self.atoms), self.typical_norm, size))
 
     @cached_property
     def rho(self) -> float:
@@ -207,6 +213,161 @@ def ridge_inverse(atoms: Array32, ridge: float) -> Array32:
     lower = np.tril(_INVERSE_OF_FACTOR(factor, lower=1, overwrite_c=1)[0]).astype(np.float32)
     lower[np.diag_indices(length)] /= 2
     return lower + lower.T
+
+
+def _penalty(
+    settings: BPDNSettings,
+    noise_sigma: float,
+    count: int,
+    typical_norm: Array | float,
+    size: Array | float,
+) -> Array:
+    """Return eta: as set, or c sigma |a| sqrt(2 log n) of n atoms of median norm |a|.
+
+    The second is the largest correlation that noise alone reaches (Donoho and Johnstone 1994 for
+    the form). Never below a small share of |I| |a|; size: |I|.
+    """
+    if settings.penalty is not None:
+        return np.full(np.shape(size), settings.penalty)
+    universal = noise_sigma * np.sqrt(2 * np.log(max(count, 2)))
+    size = np.asarray(size)
+    least = np.maximum(settings.penalty_factor * universal, settings.smallest_penalty * size)
+    return least * typical_norm
+
+
+def codes(
+    atoms: Array32,
+    data: Array32,
+    usable: NDArray[np.bool_],
+    noise_sigma: float,
+    settings: BPDNSettings,
+) -> list[Code]:
+    """Return the codes of patches that see the atoms alike, but for readings that are not usable.
+
+    atoms: (atom, padded measurement), C-contiguous. data: (patch, padded measurement), 0 where not
+    usable. usable: (patch, measurement). Raises ReconstructionError as `SensedDictionary.code`.
+    """
+    found: list[Code | Begun | None] = [None] * len(data)
+    if settings.method == "admm" and len(data) >= FEWEST_TOGETHER:
+        found = _coded_together(atoms, data, usable, noise_sigma, settings)
+    alike, which = np.unique(usable, axis=0, return_inverse=True)
+    for number, seen in enumerate(alike):
+        patches, sensed = np.flatnonzero(which.ravel() == number), None
+        for patch in patches if seen.any() else ():
+            begun = found[patch]
+            if isinstance(begun, Code):
+                continue
+            if sensed is None:
+                shown = atoms.copy()
+                shown[:, : seen.size] *= seen
+                sensed = SensedDictionary(shown, data[patches], noise_sigma, settings)
+            found[patch] = sensed.code(data[patch], int(seen.sum()), begun)
+    return [code if isinstance(code, Code) else EMPTY for code in found]
+
+
+def _coded_together(
+    atoms: Array32,
+    data: Array32,
+    usable: NDArray[np.bool_],
+    noise_sigma: float,
+    settings: BPDNSettings,
+) -> list[Code | Begun | None]:
+    """Return the codes of many patches by ADMM on all atoms, see `kernels.split`.
+
+    Begun: of a patch that is not done after STEPS_TOGETHER. None: of a patch of dark readings.
+
+    Both products with the atoms are products of matrices, of all patches at once. Readings H of a
+    patch that are not usable, K the others, leave of the inverse G = (A A^T + rho 1)^-1
+
+        (A_K A_K^T + rho 1)^-1 = G_KK - G_KH G_HH^-1 G_HK.
+    """
+    seen = np.ones_like(data)
+    seen[:, : usable.shape[1]] = usable
+    measured = usable.any(axis=1)
+    norms = np.median(np.sqrt(seen @ np.square(atoms).T), axis=1)
+    size = np.linalg.norm(data, axis=1)
+    found: list[Code | Begun | None] = [None] * len(data)
+    active = np.flatnonzero(measured & (norms * size > 0))
+    if not active.size:
+        return found
+    eta = _penalty(settings, noise_sigma, len(atoms), norms, size)
+    typical = np.sqrt(np.mean(np.square(size[active]))) / np.median(norms[active])
+    rho = float(np.median(eta[active]) / (settings.threshold * typical))
+    inverse = ridge_inverse(atoms, rho)
+    hidden, rest = _hidden(inverse, usable)
+    eta32 = eta.astype(np.float32)
+    relax, ratio = np.float32(settings.relaxation), np.float32(rho)
+    state = np.zeros((len(active), len(atoms)), np.float32)
+    kept = np.empty_like(state)
+    fitted, carried = np.zeros((2, len(active), data.shape[1]), np.float32)
+    last = min(STEPS_TOGETHER, settings.max_steps)
+    for step in range(1, last + 1):
+        of_active = seen[active]
+        miss = data[active] - 2 * fitted + carried
+        pull = miss @ inverse
+        at_hidden = np.take_along_axis(pull, hidden[active], axis=1)
+        pull -= (rest[active] @ at_hidden[..., None])[..., 0]
+        pull *= of_active
+        carried += relax * (fitted - carried + miss - ratio * pull)
+        largest, ones = kernels.split_together(
+            pull @ atoms.T, eta32[active] / ratio, relax, state, kept
+        )
+        fitted = (kept @ atoms) * of_active
+        gap = _gaps(data[active], fitted, pull, eta[active], rho, largest, ones)
+        done = (gap <= settings.rtol) | (step == last)
+        if step % CHECKED and not done.all():
+            continue
+        for place in np.flatnonzero(done):
+            patch, converged = active[place], bool(gap[place] <= settings.rtol)
+            found[patch] = Begun(state[place].copy(), step)
+            if converged or step == settings.max_steps:
+                code = kept[place].copy()
+                found[patch] = Code(code, step, converged, float(eta[patch]), float(gap[place]))
+        left = ~done
+        active, state, fitted, carried = active[left], state[left], fitted[left], carried[left]
+        kept = kept[: len(active)]
+        if not active.size:
+            break
+    return found
+
+
+def _hidden(
+    inverse: Array32, usable: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], Array32]:
+    """Return for each patch the readings H that are not usable, and G_H G_HH^-1.
+
+    inverse: G, (measurement, measurement). Results: (patch, h) and (patch, measurement, h); those
+    with fewer than the most, h, have zeros.
+    """
+    lost = ~usable
+    most = int(lost.sum(axis=1).max())
+    places = np.zeros((len(usable), most), np.int64)
+    rest = np.zeros((len(usable), len(inverse), most), np.float32)
+    for patch, of_patch in enumerate(lost):
+        at = np.flatnonzero(of_patch)
+        places[patch, : at.size] = at
+        rest[patch, :, : at.size] = np.linalg.solve(inverse[np.ix_(at, at)], inverse[at]).T
+    return places, rest
+
+
+def _gaps(
+    data: Array,
+    fitted: Array,
+    pull: Array,
+    eta: Array,
+    rho: float,
+    largest: Array,
+    ones: Array,
+) -> Array:
+    """Return the relative duality gap of each patch; pull: a dual point over rho.
+
+    largest: max |a_j . pull|. ones: |code|_1.
+    """
+    shrink = np.minimum(rho, eta / np.maximum(largest, 1e-30))[:, None]
+    exact = data.astype(np.float64)
+    objective = 0.5 * np.square(exact - fitted).sum(axis=1) + eta * ones
+    dual = 0.5 * (np.square(exact) - np.square(exact - shrink * pull)).sum(axis=1)
+    return np.where(objective > 0, (objective - dual) / np.maximum(objective, 1e-300), 0)
 
 
 class _Solver(ABC):
@@ -284,8 +445,8 @@ def _largest(values: Array, wanted: int) -> NDArray[np.bool_]:
 class _Admm(_Minimiser):
     """ADMM on a growing working set S; `bpdn_kernels.split` shows the mathematics of its steps.
 
-    Begin: FIRST_STEPS steps on all atoms, or FIRST_STEPS_OF_FEW on few, from w = 0; S = the 2 m
-    largest |w_j| of m measurements.
+    Begin: FIRST_STEPS steps on all atoms, or FIRST_STEPS_OF_FEW on few, from w = 0, or those that
+    were made together; S = the 2 m largest |w_j| of m measurements.
     Step:
         w_S = ADMM on the atoms of S alone, from w_S, to a gap of `inner`
         r   = its dual point, g_j = |a_j . r| over all atoms
@@ -294,10 +455,21 @@ class _Admm(_Minimiser):
     Result: beta = soft(w, eta / rho).
     """
 
+    def __init__(
+        self, sensed: SensedDictionary, data: Array32, measured: int, begun: Begun | None = None
+    ) -> None:
+        self.begun = begun
+        super().__init__(sensed, data, measured)
+
     def begin(self) -> None:
         self.inner = INNER_SHARE * self.settings.rtol
-        self.w = np.zeros(len(self.atoms), np.float32)
         self.dual_point = np.empty(len(self.data), np.float32)
+        if self.begun is not None:
+            self.w, self.steps = self.begun.state, self.begun.steps
+            self.working = _largest(np.abs(self.w), 2 * len(self.data))
+            self.done = not self.working.any()
+            return
+        self.w = np.zeros(len(self.atoms), np.float32)
         few = len(self.atoms) <= FEW * len(self.data)
         first = min(self.settings.max_steps, FIRST_STEPS_OF_FEW if few else FIRST_STEPS)
         run = self._split(self.atoms, self.sensed.inverse, self.settings.rtol, first, self.w)

@@ -131,3 +131,27 @@ def split(atoms, inverse, data, eta, rho, relax, rtol, max_steps, state, dual_po
                 dual_point[k] = shrink * pull[k]
             return SplitRun(step + 1, objective, gap)
     return SplitRun(max_steps, objective, gap)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def split_together(gain, thresholds, relax, states, codes):
+    """Do one step of every atom's state, (patch, atom), in place; set codes to soft(state).
+
+    gain: A^T pull, (patch, atom). thresholds: eta / rho of each patch. Returns max |gain| and
+    |code|_1 of each patch.
+    """
+    patches, atoms = gain.shape
+    largest, size = np.zeros(patches, np.float32), np.zeros(patches, np.float32)
+    for p in range(patches):
+        threshold, state, code, pulled = thresholds[p], states[p], codes[p], gain[p]
+        most, total = np.float32(0), np.float32(0)
+        for j in range(atoms):
+            value = state[j]
+            value += relax * (_soft(value, threshold) - value + pulled[j])
+            state[j] = value
+            kept = _soft(value, threshold)
+            code[j] = kept
+            most = max(most, abs(pulled[j]))
+            total += abs(kept)
+        largest[p], size[p] = most, total
+    return largest, size

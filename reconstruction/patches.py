@@ -72,13 +72,12 @@ class PatchSensing:
 
     weights: (shot, pixel, patch, ray), the coefficients of Psi; the rays of a pixel are the samples
         of its parts, a part being a view, or a colour of a view where pixels see three colours.
-        Zero where a pixel is not usable.
-    data: (patch, padded measurement), 0 where not usable. measured: usable pixels of each patch.
+    data: (patch, padded measurement), 0 where not usable. usable: (patch, measurement).
     """
 
     weights: NDArray[np.float32]
     data: NDArray[np.float32]
-    measured: NDArray[np.int64]
+    usable: NDArray[np.bool_]
 
 
 def _by_pixel(
@@ -107,17 +106,16 @@ def sense_patches(
     count = len(corners)
     weights = np.empty((shots, pixels, count, parts * k**2), dtype=np.float32)
     data = np.zeros((count, padded(shots * pixels)), dtype=np.float32)
-    measured = np.empty(count, dtype=np.int64)
+    usable = np.empty((count, shots * pixels), dtype=np.bool_)
     for i, (y, x) in enumerate(corners):
         rows, columns = slice(y, y + shape[0]), slice(x, x + shape[1])
         seen = slice(y // k, (y + shape[0]) // k), slice(x // k, (x + shape[1]) // k)
         kept = frames.usable[:, seen[0], seen[1]]
         cut = psi.weights[:, :, :, rows, :, columns].transpose(0, 1, 2, 4, 3, 5)
-        rays = _by_pixel(cut.reshape(shots, parts, samples), shape, k)
-        weights[:, :, i] = rays * kept.reshape(shots, pixels, 1)
+        weights[:, :, i] = _by_pixel(cut.reshape(shots, parts, samples), shape, k)
         data[i, : shots * pixels] = np.where(kept, frames.readings[:, seen[0], seen[1]], 0).ravel()
-        measured[i] = kept.sum()
-    return PatchSensing(weights, data, measured)
+        usable[i] = kept.ravel()
+    return PatchSensing(weights, data, usable)
 
 
 def selected_atoms(

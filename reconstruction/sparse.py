@@ -2,8 +2,8 @@
 
 For every patch, min_beta 1/2 |Psi D beta - I|^2 + eta |beta|_1 (eq. 8), or a greedy relative of
 it, with D beta the patch. The sensed dictionary Psi D is built once per patch, or once for all
-patches where mask, colours and usable pixels repeat; the sparse solver runs on it; overlapping
-patches are averaged.
+patches where mask and colours repeat; the sparse solver runs on it; overlapping patches are
+averaged.
 
 Cost of a patch with n atoms, m measurements, N samples x views (and n_c stored colours):
 building 2 n N n_c operations, `admm` n m^2 + 4 n m per pass, `lars` 4 n m per step, `omp` 2 n m
@@ -49,6 +49,8 @@ SOME = 100
 """Of so many samples the first alone rules out most atoms that are not flat."""
 BATCH_BYTES = 48 * 2**20
 """Size of the sensed dictionaries that a thread holds at a time."""
+MOST_TOGETHER = 128
+"""Patches of a class at a time: products of matrices are no faster with more."""
 
 
 class SparseSettings(Settings):
@@ -103,7 +105,7 @@ class PatchEstimates:
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """Patches whose pixels see the same colours, in classes of equal Psi and usable pixels.
+    """Patches whose pixels see the same colours, in classes of equal Psi.
 
     atoms: the different sets of atoms as shots see them, (pixel, ray, atom) each.
     set_of_shot: index of each shot's set. classes: indices of the patches of each class. sensing:
@@ -175,23 +177,24 @@ class _Coder:
             yield colours, np.array(members)
 
     def _classes(self, patches: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """Return the patches in groups of equal Psi and usable pixels: one sensed dictionary."""
+        """Return the patches in groups of equal Psi: one sensed dictionary."""
 
         def key(corner: NDArray[np.int64]) -> bytes:
             (y, x), (rows, columns) = corner, self.grid.shape
             weights = self.psi.weights[:, :, :, y : y + rows, :, x : x + columns]
-            digest = hashlib.blake2b(np.ascontiguousarray(weights).data, digest_size=16)
-            usable = self._cut(self.frames.usable, corner, self.psi.binning)
-            digest.update(np.ascontiguousarray(usable).data)
-            return digest.digest()
+            return hashlib.blake2b(np.ascontiguousarray(weights).data, digest_size=16).digest()
 
-        groups = _grouped(key(corner) for corner in self.grid.corners[patches])
-        return [patches[places] for places in groups.values()]
+        groups = _grouped(key(corner) for corner in self.grid.corners[patches]).values()
+        self.classes += len(groups)
+        return [
+            patches[places[first : first + MOST_TOGETHER]]
+            for places in groups
+            for first in range(0, len(places), MOST_TOGETHER)
+        ]
 
     def batches(self) -> Iterator[_Batch]:
         """Yield all patches; a batch's sensed dictionaries fit into BATCH_BYTES."""
-        measurements = self.psi.shots * self.pixels
-        fitting = max(1, int(BATCH_BYTES // (4 * len(self.atoms) * (measurements + 8))))
+        of_class = len(self.atoms) * (self.psi.shots * self.pixels + 8)
         for colours, patches in self._colour_groups():
             if colours is None:
                 sets = [selected_atoms(self.atoms, None, self.psi.binning)]
@@ -207,7 +210,9 @@ class _Coder:
                     for shot in range(self.psi.shots)
                 ]
             classes = self._classes(patches)
-            self.classes += len(classes)
+            largest = max(map(len, classes))
+            size = 4 * (of_class + 2 * largest * self.matrix.shape[1])
+            fitting = max(1, BATCH_BYTES // size)
             at_once = min(fitting, max(1, len(classes) // (4 * get_num_threads())))
             for start in range(0, len(classes), at_once):
                 part = classes[start : start + at_once]
@@ -216,10 +221,9 @@ class _Coder:
                 yield _Batch(sets, set_of_shot, part, sensing)
 
     def code(self, batch: _Batch) -> _CodedBatch:
-        """Return the batch with a code and an estimate of each patch.
+        """Return the batch with a code and an estimate of each patch, D beta.
 
-        Psi D is built shot by shot, once for each class; then every patch of a class is coded in
-        it, and its estimate is D beta.
+        Psi D is built shot by shot, once for each class.
         """
         sensing = batch.sensing
         counts = np.array([len(members) for members in batch.classes])
@@ -232,18 +236,12 @@ class _Coder:
         estimates = np.zeros((ends[-1], self.matrix.shape[1]), dtype=np.float32)
         codes = []
         for atoms, first, end in zip(sensed, firsts, ends, strict=True):
-            if not sensing.measured[first]:
-                codes += [bpdn.EMPTY] * (end - first)
-                continue
-            dictionary = bpdn.SensedDictionary(
-                atoms, sensing.data[first:end], self.frames.noise_sigma, self.settings.solver
-            )
-            for i in range(first, end):
-                code = dictionary.code(sensing.data[i], int(sensing.measured[i]))
-                codes.append(code)
-                used = np.flatnonzero(code.weights)
-                estimates[i] = code.weights[used] @ self.matrix[used]
-        return _CodedBatch(batch.patches, estimates, sensing.measured, codes)
+            of_class = sensing.data[first:end], sensing.usable[first:end]
+            codes += bpdn.codes(atoms, *of_class, self.frames.noise_sigma, self.settings.solver)
+        for estimate, code in zip(estimates, codes, strict=True):
+            used = np.flatnonzero(code.weights)
+            estimate[:] = code.weights[used] @ self.matrix[used]
+        return _CodedBatch(batch.patches, estimates, sensing.usable.sum(axis=1), codes)
 
 
 @one_blas_thread()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from emmc_rig.reconstruction import bpdn
 from emmc_rig.reconstruction.bpdn import CHOICE_RIDGE, BPDNSettings, SensedDictionary, ridge_inverse
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.patches import padded
@@ -248,3 +249,50 @@ def test_the_default_settings_reach_the_objective_of_ten_thousand_plain_steps_to
         code = solve_bpdn(atoms, data, settings=BPDNSettings(method="admm", penalty=eta))
         assert objective(atoms, data, eta, code.weights) <= reached * (1 + 1e-3)
         assert code.steps < 200
+
+
+@pytest.mark.parametrize("together", [1, 30, 3000])
+def test_patches_together_have_the_codes_of_each_alone(monkeypatch, together):
+    """Whether all steps, some or hardly any are made together; readings that are lost differ."""
+    monkeypatch.setattr(bpdn, "STEPS_TOGETHER", together)
+    rng = np.random.default_rng(3)
+    atoms = np.zeros((60, padded(20)), np.float32)
+    atoms[:, :20] = rng.normal(size=(60, 20)) * rng.uniform(0.3, 2, (60, 1))
+    usable = rng.uniform(size=(bpdn.FEWEST_TOGETHER + 3, 20)) > 0.15
+    usable[0] = False
+    usable[1] = True
+    data = np.zeros((len(usable), atoms.shape[1]), np.float32)
+    data[:, :20] = rng.normal(size=usable.shape) * usable
+    settings = BPDNSettings(rtol=1e-5, max_steps=20000)
+    found = bpdn.codes(atoms, data, usable, 0.05, settings)
+    assert not found[0].weights.any()
+    assert len({seen.tobytes() for seen in usable}) > bpdn.FEWEST_TOGETHER
+    for code, row, seen in zip(found[1:], data[1:], usable[1:], strict=True):
+        shown = atoms[:, :20].astype(float) * seen
+        alone = SensedDictionary(
+            np.pad(shown, ((0, 0), (0, atoms.shape[1] - 20))).astype(np.float32),
+            row[None],
+            0.05,
+            settings,
+        )
+        assert code.converged
+        assert together < 3000 or code.steps <= together
+        assert code.penalty == pytest.approx(alone.penalty(row), rel=1e-5)
+        least = objective(
+            shown,
+            row[:20],
+            code.penalty,
+            coordinate_descent(shown, row[:20].astype(float), code.penalty),
+        )
+        assert objective(shown, row[:20], code.penalty, code.weights) == pytest.approx(
+            least, rel=2e-5
+        )
+
+
+def test_patches_together_stop_at_the_step_limit():
+    atoms, data, _ = problem(60, 16, noise=0.1)
+    rows = np.repeat(data[None], bpdn.FEWEST_TOGETHER, axis=0).astype(np.float32)
+    settings = BPDNSettings(rtol=1e-5, max_steps=3)
+    usable = np.ones(rows.shape, bool)
+    found = bpdn.codes(atoms.astype(np.float32), rows, usable, 0.05, settings)
+    assert [(code.steps, code.converged) for code in found] == [(3, False)] * len(rows)
