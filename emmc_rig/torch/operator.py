@@ -21,7 +21,7 @@ SINGULAR = 1e-9
 of float32 weights, by the rounding of float64, and different shots 1e-4 or more."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TorchPsi:
     """Psi in PyTorch: `psi(light_field)` are frames, with gradients of light field and weights.
 
@@ -56,6 +56,9 @@ class TorchPsi:
         """(shot, pixel_y, pixel_x)."""
         shots, _, _, rows, _, columns = self.weights.shape
         return shots, rows // self.binning, columns // self.binning
+
+    def __repr__(self) -> str:
+        return f"TorchPsi({self.light_field_shape} -> {self.frames_shape}, {self.weights.device})"
 
     def __call__(self, light_field: Tensor) -> Tensor:
         """Return the frames (..., shot, pixel_y, pixel_x) of a light field (..., v, u, y, x, 3)."""
