@@ -105,7 +105,8 @@ class TorchPsi:
     def solve(self, frames: Tensor, ridge: Any) -> Tensor:
         """Return (Psi Psi^T + diag(ridge))^-1 frames; ridge: above 0, broadcast to the frames."""
         by_pixel = _required(frames, self.frames_shape, "frames").double().movedim(-3, -1)
-        spread = torch.as_tensor(ridge).to(by_pixel).expand(frames.shape).movedim(-3, -1)
+        spread = torch.as_tensor(ridge, dtype=torch.double, device=by_pixel.device)
+        spread = spread.expand(frames.shape).movedim(-3, -1)
         if len(self.weights) == 1:  # many times faster than a solver for blocks
             solved = by_pixel / (self.gram[..., 0] + spread)
         else:

@@ -59,5 +59,5 @@ class ViewsPhysics(LinearPhysics):
         """
         if not isinstance(z, Tensor):
             z = torch.full_like(self.A_adjoint(y), z or 0.0)
-        ridge = 1 / torch.as_tensor(gamma, device=y.device).reshape(-1, 1, 1, 1)
+        ridge = 1 / torch.as_tensor(gamma, dtype=torch.double).reshape(-1, 1, 1, 1)
         return z + self.A_adjoint(self.psi.solve(y - self.A(z), ridge))
