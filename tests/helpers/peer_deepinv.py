@@ -1,8 +1,8 @@
 """Importing this module imports deepinv, or skips tests where the extra `torch` is not installed.
 
-PyPI's torchvision, which deepinv imports, needs PyPI's build of PyTorch. Beside a build for CPUs
-alone it declares none of its compiled operators, and fails at the first one that it extends.
-Nothing here calls them: declared by name, they let the import pass.
+PyPI's torchvision, which deepinv imports, needs PyPI's build of PyTorch. With a build for CPUs the
+compiled operators of torchvision are missing: the import of torchvision fails. A declaration of two
+operators lets the import pass. Neither deepinv's solvers nor the tests call the operators.
 """
 
 import pytest

@@ -1,6 +1,7 @@
 """Psi as a physics of deepinv: its tests, exact data steps, plug-and-play; the examples."""
 
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,12 @@ def test_another_type_and_other_weights_are_followed(psi):
     assert operator.double().A_dagger(y.double()).dtype == torch.double
     operator.update(weights=2 * operator.weights)
     torch.testing.assert_close(operator.A(x.double()), 2 * y.double(), rtol=1e-4, atol=1e-6)
+
+
+def test_without_deepinv_a_line_names_the_extra(psi, monkeypatch):
+    monkeypatch.setitem(sys.modules, "deepinv", None)
+    with pytest.raises(emmc.ERRORS, match=r'needs deepinv: pip install "emmc-rig\[torch\]"$'):
+        physics(psi)
 
 
 def test_readings_that_are_not_usable_are_ignored(psi):

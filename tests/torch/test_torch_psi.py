@@ -1,4 +1,4 @@
-"""Psi in PyTorch: equal to Psi in NumPy, its adjoint, its solves, and gradients of all of it."""
+"""Psi in PyTorch against Psi in NumPy and dense matrices; gradients of every operation."""
 
 from dataclasses import replace
 
