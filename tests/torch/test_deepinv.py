@@ -76,7 +76,7 @@ def test_another_type_and_other_weights_are_followed(psi):
     x = images(operator)
     y = operator.A(x)
     assert operator.double().A_dagger(y.double()).dtype == torch.double
-    operator.update(weights=2 * operator.weights)
+    operator.update(weights=2 * operator.psi.weights)
     torch.testing.assert_close(operator.A(x.double()), 2 * y.double(), rtol=1e-4, atol=1e-6)
 
 
@@ -102,7 +102,7 @@ def test_deepinvs_total_variation_in_plug_and_play_gains_on_the_start():
     frames = camera.expose(scene, seed=0, psi=taken)
     operator = physics(taken, usable=frames.usable)
     y = torch.tensor(frames.readings, dtype=torch.float32)[None]
-    start = torch.full((1, *operator.img_size), float(y.mean()))
+    start = torch.full_like(operator.A_adjoint(y), float(y.mean()))
     denoiser = deepinv.models.TimeAgnosticNet(deepinv.models.TVDenoiser(n_it_max=30))
     sigmas = np.geomspace(1, 0.02, 12)
     solver = deepinv.optim.HQS(
@@ -130,7 +130,7 @@ def run(text, capsys):
     numbers = r"\d+\.\d"
     words = re.escape(re.sub(numbers, "@", printed)).replace("@", f"({numbers})")
     stated = re.search(f"`{words}`", PAGE.read_text("utf-8"))
-    assert stated, printed
+    assert stated is not None, printed
     found = [float(number) for number in re.findall(numbers, printed)]
     np.testing.assert_allclose([float(number) for number in stated.groups()], found, atol=0.11)
     return names

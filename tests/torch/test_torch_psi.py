@@ -14,7 +14,7 @@ KINDS = [(1, 1, 1), (3, 1, 1), (2, 3, 2)]
 """Shots, stored colours, binning."""
 
 
-def random_psi(shots, stored, binning, size=(4, 6), dtype=np.float64):
+def random_psi(shots, stored, binning, size=(4, 6), dtype="f8"):
     """Return a Psi of 2x3 views of random weights, of pixels that see random colours."""
     rng = np.random.default_rng(0)
     weights = rng.uniform(0, 1, (shots, 2, 3, size[0], stored, size[1])).astype(dtype)
@@ -94,10 +94,8 @@ def test_solve_and_pseudo_inverse_are_those_of_the_dense_matrix(kind):
 
 
 def test_repeated_shots_of_float32_do_not_amplify_noise():
-    psi = random_psi(1, 1, 1, dtype=np.float32)
-    twice = replace(
-        psi, weights=psi.weights.repeat(2, axis=0), colour=psi.colour.repeat(2, axis=0)
-    ).to_torch()
+    psi = random_psi(1, 3, 1, dtype="f4")
+    twice = replace(psi, weights=psi.weights.repeat(2, axis=0)).to_torch()
     frames = torch.rand(twice.frames_shape)
     expected = psi.to_torch().pseudo_inverse(frames.mean(0, keepdim=True))
     np.testing.assert_allclose(twice.pseudo_inverse(frames), expected, rtol=1e-4, atol=1e-6)
