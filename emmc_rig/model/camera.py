@@ -415,7 +415,7 @@ class Plate:
 
 
 @dataclass(frozen=True)
-class _Axis:
+class BeamAxis:
     """One axis of the camera, in um: where samples and openings lie and how wide they are.
 
     openings_um, opening_widths_um: of every view, or of every box of views that are cut.
@@ -427,7 +427,7 @@ class _Axis:
     opening_widths_um: NDArray[np.float64]
     lens_um: float
 
-    def split(self, splits: int, sample_part: int, opening_part: int) -> _Axis:
+    def split(self, splits: int, sample_part: int, opening_part: int) -> BeamAxis:
         """Return the axis of one part of `splits` in every sample and every opening."""
 
         def shifted(
@@ -435,7 +435,7 @@ class _Axis:
         ) -> NDArray[np.float64]:
             return positions + (part - (splits - 1) / 2) * (width / splits)
 
-        return _Axis(
+        return BeamAxis(
             shifted(self.samples_um, self.sample_width_um, sample_part),
             shifted(self.openings_um, self.opening_widths_um, opening_part),
             self.sample_width_um / splits,
@@ -455,22 +455,28 @@ class _Axis:
         edge = mask_position(self.samples_um[-1], self.openings_um[-1], distance_um, self.lens_um)
         return float(edge) + self.footprint(distance_um, -1).half_width_um
 
+    def meets_um(self, distance_um: float, opening: int) -> NDArray[np.float64]:
+        """Return where the rays of every sample and one opening meet a mask at a distance."""
+        return mask_position(self.samples_um, self.openings_um[opening], distance_um, self.lens_um)
+
     def weights(self, opening: int, plate: Plate, cell_count: int, offset_um: float) -> CellWeights:
         """Return (sample, cell): the share of every mask cell seen through one opening."""
         distance_um = plate.distance_mm * 1e3
-        meets = mask_position(self.samples_um, self.openings_um[opening], distance_um, self.lens_um)
         return cell_weights(
-            meets - offset_um, self.footprint(distance_um, opening), plate.cell_um, cell_count
+            self.meets_um(distance_um, opening) - offset_um,
+            self.footprint(distance_um, opening),
+            plate.cell_um,
+            cell_count,
         )
 
 
-def _axes(camera: Camera, size: tuple[int, int]) -> tuple[_Axis, _Axis]:
+def _axes(camera: Camera, size: tuple[int, int]) -> tuple[BeamAxis, BeamAxis]:
     """Return the y and the x axis of a camera for a light field of `size` samples, views whole."""
     lens, sensor = camera.lens, camera.sensor
     cell_um = lens.aperture_cell_um
 
-    def axis(samples: int, views: int) -> _Axis:
-        return _Axis(
+    def axis(samples: int, views: int) -> BeamAxis:
+        return BeamAxis(
             centred_grid(samples, sensor.sample_pitch_um),
             centred_grid(views, cell_um),
             sensor.sample_pitch_um * sensor.pixel_fill,
@@ -481,7 +487,7 @@ def _axes(camera: Camera, size: tuple[int, int]) -> tuple[_Axis, _Axis]:
     return axis(size[0], camera.views[0]), axis(size[1], camera.views[1])
 
 
-def _cell_count(axis: _Axis, mask: Mask, offsets_um: list[float], pitch_um: float) -> int:
+def _cell_count(axis: BeamAxis, mask: Mask, offsets_um: list[float], pitch_um: float) -> int:
     """Return how many cells a mask needs along an axis, with its spare ones on both sides.
 
     The parity puts the edges of cells that project onto one sample on the edges of the samples.
@@ -554,14 +560,14 @@ class _Box(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Field:
+class BeamField:
     """A part of the picture and the openings that its pixels see: of all samples, or by a knot.
 
     boxes: of the views that are open. open: shares of all views together. rows, columns: of the
     picture. blend: (y, x), how much the part counts at its samples; 1: wholly.
     """
 
-    axes: tuple[_Axis, _Axis]
+    axes: tuple[BeamAxis, BeamAxis]
     boxes: dict[tuple[int, int], list[_Box]]
     open: float
     rows: slice
@@ -569,7 +575,7 @@ class _Field:
     blend: NDArray[np.float32] | float = 1.0
 
 
-def _fields(camera: Camera, size: tuple[int, int]) -> list[_Field]:
+def beam_fields(camera: Camera, size: tuple[int, int]) -> list[BeamField]:
     """Return the parts of the picture with the openings that they see, see `field_knots`."""
     axes = _axes(camera, size)
     knots = field_knots(
@@ -591,12 +597,12 @@ def _fields(camera: Camera, size: tuple[int, int]) -> list[_Field]:
 
 def _field(
     camera: Camera,
-    axes: tuple[_Axis, _Axis],
+    axes: tuple[BeamAxis, BeamAxis],
     pixel_um: tuple[float, float],
     rows: slice,
     columns: slice,
     blend: NDArray[np.float32] | float = 1.0,
-) -> _Field:
+) -> BeamField:
     """Return a part of the picture whose pixels see the views as the one at (x, y) does.
 
     Whole views share the openings of their row and their column; boxes of cut views follow them.
@@ -630,13 +636,13 @@ def _field(
             axes, (rows, columns), found.view[chosen].T, beside, wide, strict=True
         )
     )
-    return _Field(
+    return BeamField(
         (down, across), boxes, float(shares[shares >= LEAST_SHARE].sum()), rows, columns, blend
     )
 
 
 def _cells_seen(
-    camera: Camera, plates: dict[str, Plate], shot: int, axis: int, along: _Axis
+    camera: Camera, plates: dict[str, Plate], shot: int, axis: int, along: BeamAxis
 ) -> dict[str, list[CellWeights]]:
     """Return the matrix (sample, cell) of each opening, by mask in the beam of a shot.
 
@@ -668,7 +674,7 @@ def _transmittances(
 
     Without a pupil every view is a box of share 1: t_view = t_box.
     """
-    fields = _fields(camera, size)
+    fields = beam_fields(camera, size)
     through = [_through_masks(camera, field, plates, shot) for field in fields]
     pupil = camera.lens.pupil
     scale: NDArray[np.floating] | float = 1.0
@@ -690,7 +696,7 @@ def _transmittances(
 
 
 def _through_masks(
-    camera: Camera, field: _Field, plates: dict[str, Plate], shot: int
+    camera: Camera, field: BeamField, plates: dict[str, Plate], shot: int
 ) -> Callable[[int, int], NDArray[np.float32]]:
     """Return a function of the openings along y and x: the transmittance (y, x, colour) of a box.
 
@@ -783,7 +789,7 @@ def seen_of_white(
     layout = psi_layout(camera, size)
     colour = layout.colour
     seen = np.empty((layout.shots, *layout.weights_shape[3:]))
-    for shot, share in enumerate(_shares(camera, size)):
+    for shot, share in enumerate(open_shares(camera, size)):
         passed = _passed_to_all(camera, size, plates, shot) * share
         if colour is not None:
             index = colour[shot][..., None].astype(np.intp)
@@ -814,7 +820,7 @@ def _passed_to_all(
     return np.stack([down @ (right @ cells[:, :, c].T).T for c in range(3)], axis=-1)
 
 
-def _shares(camera: Camera, size: tuple[int, int]) -> list[NDArray[np.float32]]:
+def open_shares(camera: Camera, size: tuple[int, int]) -> list[NDArray[np.float32]]:
     """Return an open camera's Psi, r / (sum_c r  V U k^2), (y, x, colour) of each shot."""
     response = sensor_response(camera, size)
     scale = camera.views[0] * camera.views[1] * camera.sensor.binning**2
@@ -842,7 +848,7 @@ def build_imaging_matrix(
     plates = draw_plates(camera, size) if plates is None else plates
     layout = psi_layout(camera, size)
     colour, weights = layout.colour, np.empty(layout.weights_shape, dtype=np.float32)
-    for shot, share in enumerate(_shares(camera, size)):
+    for shot, share in enumerate(open_shares(camera, size)):
         for v, u, passed in _transmittances(camera, size, plates, shot):
             passed *= share
             if colour is not None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,18 +63,21 @@ class Footprint:
         return (self.pixel_um + self.aperture_um) / 2
 
 
-def _covered(edge_um: NDArray[np.float64], footprint: Footprint) -> NDArray[np.float64]:
-    """Return the share of the footprint that lies below `edge_um` (relative to its centre)."""
+def covered(edge_um: Any, footprint: Footprint) -> Any:
+    """Return the share of the footprint that lies below `edge_um` (relative to its centre).
+
+    edge_um: an array, or a tensor of PyTorch: the share is of the same kind.
+    """
     wide = max(footprint.pixel_um, footprint.aperture_um)
     narrow = min(footprint.pixel_um, footprint.aperture_um)
     if wide == 0:
-        return np.where(edge_um > 0, 1.0, 0.0)
+        return (edge_um > 0) * 1.0
     if narrow < 1e-6 * wide:
-        return np.clip(edge_um / wide + 0.5, 0, 1)
+        return (edge_um / wide + 0.5).clip(0, 1)
     outer, inner = (wide + narrow) / 2, (wide - narrow) / 2
-    rise = np.clip(edge_um + outer, 0, narrow)
-    fall = np.clip(edge_um - inner, 0, narrow)
-    flat = np.clip(edge_um + inner, 0, 2 * inner)
+    rise = (edge_um + outer).clip(0, narrow)
+    fall = (edge_um - inner).clip(0, narrow)
+    flat = (edge_um + inner).clip(0, 2 * inner)
     return (rise**2 / 2 / narrow + flat + fall - fall**2 / 2 / narrow) / wide
 
 
@@ -117,6 +121,19 @@ class CellWeights:
         return self @ np.eye(self.cells)
 
 
+def require_reach(
+    farthest_um: float, footprint: Footprint, cell_um: float, cell_count: int
+) -> None:
+    """Raise CameraError where a footprint, `farthest_um` from the middle, leaves the mask."""
+    reach = farthest_um + footprint.half_width_um
+    if reach > cell_count * cell_um / 2 * (1 + 1e-9):
+        needed = int(np.ceil(2 * reach / cell_um - 1e-9))
+        raise CameraError(
+            f"the mask is smaller than the beam: it has {cell_count} cells of {cell_um:g} um, "
+            f"the beam needs {needed}; enlarge the mask or reduce its offset"
+        )
+
+
 def cell_weights(
     positions_um: NDArray[np.float64],
     footprint: Footprint,
@@ -130,20 +147,14 @@ def cell_weights(
     Returns a matrix (n, cell_count) whose rows sum to 1.
     Raises CameraError when a footprint reaches beyond the mask.
     """
+    require_reach(float(np.abs(positions_um).max()), footprint, cell_um, cell_count)
     half = cell_count * cell_um / 2
-    reach = np.abs(positions_um).max() + footprint.half_width_um
-    if reach > half * (1 + 1e-9):
-        needed = int(np.ceil(2 * reach / cell_um - 1e-9))
-        raise CameraError(
-            f"the mask is smaller than the beam: it has {cell_count} cells of {cell_um:g} um, "
-            f"the beam needs {needed}; enlarge the mask or reduce its offset"
-        )
     first = np.floor((positions_um - footprint.half_width_um + half) / cell_um + 1e-9).astype(int)
     first = np.clip(first, 0, cell_count - 1)
     band = int(np.ceil(2 * footprint.half_width_um / cell_um)) + 2
     index = first[:, None] + np.arange(band + 1)[None, :]
     edges_um = index * cell_um - half - positions_um[:, None]
-    below = _covered(edges_um, footprint)
+    below = covered(edges_um, footprint)
     below[:, 0] = 0.0
     values = np.diff(below, axis=1)
     values[values < SMALLEST_SHARE] = 0

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -41,6 +41,8 @@ from emmc_rig.model.view_axes import (
 
 if TYPE_CHECKING:  # SciPy loads for a third of a second, which few need
     from scipy import sparse
+
+    from emmc_rig.torch import TorchPsi
 
 Array = NDArray[np.floating]
 WEIGHTS_TAKE = "an array (shot, v, u, y, stored colour, x), float32 or float64"
@@ -346,6 +348,15 @@ class ImagingMatrix(PsiLayout):
     def light_efficiency(self) -> float:
         """Return the reading from a white light field, averaged over shots and pixels."""
         return float(self.weights.sum(dtype=np.float64) / np.prod(self.frames_shape))
+
+    def to_torch(self, device: Any = None) -> TorchPsi:
+        """Return Psi in PyTorch, whose results have gradients; raises SensingError without it.
+
+        device: where, as PyTorch names it; None: the CPU.
+        """
+        from emmc_rig.torch import TorchPsi
+
+        return TorchPsi.of(self, device)
 
     def to_scipy(self) -> sparse.csr_array:
         """Return Psi as an explicit sparse matrix without its zeros."""

@@ -126,6 +126,15 @@ def test_an_array_for_a_psi_of_no_known_camera_needs_its_noise(taken):
         emmc.reconstruct(psi, frames.readings[:, :-2])
 
 
+def test_without_pytorch_a_line_names_the_extra(taken, monkeypatch):
+    _, psi, _ = taken
+    for name in [name for name in sys.modules if name.startswith("emmc_rig.torch")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(emmc.ERRORS, match=r'needs torch: pip install "emmc-rig\[torch\]"$'):
+        psi.to_torch()
+
+
 @pytest.mark.slow
 def test_frames_are_arrays_to_numpy(taken):
     scene, psi, frames = taken
@@ -191,6 +200,7 @@ def test_public_names_are_functions_and_classes_and_no_folder_is_called_as_one()
     [
         ("emmc_rig", ["numpy", "pydantic", "typer"]),
         ("emmc_rig.captures.run", ["matplotlib"]),
+        ("emmc_rig.process.reconstructing", ["torch"]),
         ("emmc_rig.captures.sequencer", ["matplotlib"]),
         ("emmc_rig.cli", ["numpy", "scipy", "cv2", "numba", "matplotlib", "pydantic"]),
     ],

@@ -13,7 +13,7 @@ channel. Psi enters as data only, so one set of weights serves any Psi of these 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 
 import numpy as np
@@ -25,6 +25,7 @@ from torch.nn import functional as F  # noqa: N812
 from emmc_rig.model.sensing import ImagingMatrix
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.problem import smooth_guess
+from emmc_rig.torch import TorchPsi
 from emmc_rig_unrolled.weights import Architecture, NetworkWeights
 
 Array = NDArray[np.floating]
@@ -42,38 +43,32 @@ UNUSED = 1e6
 class Capture:
     """What a network reconstructs from, with the views as a batch, brightness about 1.
 
-    psi: (shot, view, colour, y, x). gram: Psi Psi^T, (pixel_y, pixel_x, shot, shot). frames,
-    variance: (shot, pixel_y, pixel_x). guess: (colour, y, x). binning: k. brightness: by which
-    frames were divided.
+    psi: in PyTorch. frames, variance: (shot, pixel_y, pixel_x). guess: (colour, y, x). brightness:
+    by which frames were divided.
     """
 
-    psi: Tensor
-    gram: Tensor
+    psi: TorchPsi
     frames: Tensor
     variance: Tensor
     guess: Tensor
-    binning: int
     brightness: float
 
     def forward(self, light_field: Tensor) -> Tensor:
         """Return the frames of a light field (view, colour, y, x)."""
-        seen = torch.einsum("svcyx,vcyx->syx", self.psi, light_field)
-        k = self.binning
-        return seen if k == 1 else k * k * F.avg_pool2d(seen[None], k)[0]
+        return self.psi(light_field.unflatten(0, self.psi.light_field_shape[:2]).movedim(2, -1))
 
     def adjoint(self, frames: Tensor) -> Tensor:
         """Return Psi^T frames, (view, colour, y, x)."""
-        k = self.binning
-        spread = frames.repeat_interleave(k, 1).repeat_interleave(k, 2) if k > 1 else frames
-        return torch.einsum("svcyx,syx->vcyx", self.psi, spread)
+        return by_view(self.psi.adjoint(frames))
 
     def solved(self, frames: Tensor, spread: Tensor) -> Tensor:
         """Return (Psi Psi^T + var / spread^2)^-1 frames."""
-        ridge = (self.variance / spread**2 + 1e-6).permute(1, 2, 0)
-        if len(frames) == 1:
-            return frames / (self.gram[..., 0, 0] + ridge[..., 0])
-        blocks = self.gram + torch.diag_embed(ridge)
-        return torch.linalg.solve(blocks, frames.permute(1, 2, 0)).permute(2, 0, 1)
+        return self.psi.solve(frames, self.variance / spread**2 + 1e-6)
+
+
+def by_view(light_field: Tensor) -> Tensor:
+    """Return a light field (v, u, y, x, colour) as (view, colour, y, x)."""
+    return light_field.flatten(0, 1).movedim(-1, 1)
 
 
 def captured(
@@ -82,18 +77,13 @@ def captured(
     """Return a capture as the network takes it; arrays as every method gets them."""
     guess = smooth_guess(psi, frames, usable)
     brightness = max(float(guess.mean()), 1e-9)
-    weights = torch.from_numpy(psi.weights).permute(0, 1, 2, 4, 3, 5).flatten(1, 2)
-    if psi.colour is not None:
-        one_hot = torch.from_numpy(psi.colour[:, None] == np.arange(3)[:, None, None])
-        weights = weights * one_hot[:, None]
     var = np.where(usable, variance / brightness**2, UNUSED)
+    in_torch = psi.to_torch()
     return Capture(
-        weights.float().contiguous(),
-        torch.from_numpy(psi.gram).float().permute(2, 3, 0, 1).contiguous(),
+        replace(in_torch, weights=in_torch.weights.float()),
         torch.from_numpy(np.where(usable, frames / brightness, 0)).float(),
         torch.from_numpy(var).float(),
         torch.from_numpy(guess / brightness).float().permute(2, 0, 1).contiguous(),
-        psi.binning,
         brightness,
     )
 
@@ -148,7 +138,7 @@ class Unrolled(nn.Module):
     def forward(self, capture: Capture) -> list[Tensor]:
         """Return the light field after each stage; brightness as the capture's."""
         rows, columns = capture.guess.shape[1:]
-        views = capture.psi.shape[1]
+        views = prod(capture.psi.light_field_shape[:2])
         pad = 0, columns % 2, 0, rows % 2
         spread = self.log_spread.exp()
         guess = capture.guess.expand(views, -1, -1, -1)
@@ -175,14 +165,13 @@ class Unrolled(nn.Module):
     @staticmethod
     def _fixed(capture: Capture, guess: Tensor, spread: Tensor) -> Tensor:
         """Return what of the input is the same in all stages: coverage, guess, noise."""
-        norm = torch.diagonal(capture.gram, dim1=2, dim2=3).permute(2, 0, 1)
+        norm = capture.psi.gram.diagonal(dim1=2, dim2=3).permute(2, 0, 1).float()
         inverse = 1 / (norm + capture.variance / spread.detach() ** 2 + 1e-6)
-        k = capture.binning
+        k = capture.psi.binning
         noise = (capture.variance.clamp(max=1) * inverse).mean(0, keepdim=True).sqrt()
-        if k > 1:
-            inverse = inverse.repeat_interleave(k, 1).repeat_interleave(k, 2)
-            noise = noise.repeat_interleave(k, 1).repeat_interleave(k, 2)
-        coverage = torch.einsum("svcyx,syx->vcyx", capture.psi**2, inverse)
+        noise = noise.repeat_interleave(k, 1).repeat_interleave(k, 2)
+        squares = replace(capture.psi, weights=capture.psi.weights**2)
+        coverage = by_view(squares.adjoint(inverse))
         noise = SCALE * noise.expand(len(guess), 1, -1, -1)
         return torch.cat([coverage, guess - 1, noise], 1)
 
