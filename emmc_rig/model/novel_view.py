@@ -150,6 +150,39 @@ def between(light_field: Array, disparities: Array, v: float, u: float) -> Array
     return total / weights[..., None]
 
 
+def all_in_focus(light_field: Array, disparity: Array) -> NDArray[np.float32]:
+    """Return the centre view (y, x, c) with less noise: the mean of all views along its disparity.
+
+        mean = sum_k w_k L_k / sum_k w_k,   w_k = exp(-|L_k - L_0|^2 / (2 m)),
+
+    with L_k what view k has at each point of the centre view L_0, and m the median of |L_k - L_0|^2
+    over views and points: surfaces that a view does not see, and reflections, count little.
+
+    disparity: (y, x) of the centre view, finite.
+    """
+    y, x = np.mgrid[: light_field.shape[2], : light_field.shape[3]].astype(np.float32)
+    middle = tuple(count // 2 for count in light_field.shape[:2])
+    seen = [
+        cv2.remap(
+            np.ascontiguousarray(light_field[v, u], np.float32),
+            x + disparity * np.float32(u - middle[1]),
+            y + disparity * np.float32(v - middle[0]),
+            cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
+        )
+        for v, u in np.ndindex(light_field.shape[:2])
+        if (v, u) != middle
+    ]  # fmt: skip
+    centre = centre_view(light_field)
+    apart = [np.square(view - centre).sum(axis=-1) for view in seen]
+    typical = np.float32(2 * np.median(apart) + 1e-12)
+    total, weights = centre.astype(np.float32), np.ones(disparity.shape, np.float32)
+    for view, square in zip(seen, apart, strict=True):
+        weight = np.exp(-square / typical)
+        total += weight[..., None] * view
+        weights += weight
+    return np.clip(total / weights[..., None], 0, 1)
+
+
 def centre_disparity(light_field: Array, disparity: Array | None) -> NDArray[np.float32]:
     """Return a finite disparity (y, x) of the centre view: the given one, or an estimate."""
     if disparity is None or disparity.shape != centre_view(light_field).shape[:2]:

@@ -419,7 +419,7 @@ MISTAKES = {
     "exposing a name": (lambda t: api.camera("rgbw-mono").expose("dark"), "scene: got 'dark'"),
     "a Psi of no camera": (
         lambda t: api.reconstruct(replace(t[1], camera_json="{}"), t[2].readings),
-        "the imaging matrix's camera: title: field required",
+        "Psi's camera: title: field required",
     ),
     "frames of lists": (lambda t: api.Frames([1], [1], [1]), "readings: got list"),
     "frames of two shapes": (
