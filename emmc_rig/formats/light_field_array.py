@@ -100,10 +100,10 @@ class LightFieldArray:
             ArgumentError: no disparity and no depth, or both.
             CameraError: a depth without the optics.
         """
-        takes = "a number: give either disparity, in pixels per view step, or depth_mm"
+        takes = "one number: either disparity, in pixels per view step, or depth_mm"
         given = depth_mm if disparity is None else disparity
         if (disparity is not None) + (depth_mm is not None) != 1 or not _is_finite(given):
-            raise refusal((disparity, depth_mm), "disparity, depth_mm", takes)
+            raise refusal(given, "refocus", takes)
         if depth_mm is not None:
             if depth_mm <= 0:
                 raise refusal(depth_mm, "depth_mm", "a distance from the lens above 0")
