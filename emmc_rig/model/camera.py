@@ -68,7 +68,7 @@ class Lens(Settings):
 
     @model_serializer(mode="wrap")
     def _as_before(self, described: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Return what describes the lens; of what is not known as earlier versions hashed it."""
+        """Return what describes the lens; without unknown keys, as earlier versions hashed it."""
         plain = described(self)
         for name in ("pupil", "focus_mm"):
             if getattr(self, name) is None:
@@ -121,10 +121,8 @@ class Mask(Settings):
     def _placed(cls, data: object) -> object:
         """Refuse cells alone, and take those of a pattern as they are."""
         if isinstance(data, list):
-            raise ValueError(
-                "cells alone do not say where the mask is: {'distance_mm': ..., 'cell_um': ..., "
-                "'pattern': cells}"
-            )
+            known = "{'distance_mm': ..., 'cell_um': ..., 'pattern': cells}"
+            raise ValueError(f"cells alone do not say where the mask is: {known}")
         if isinstance(data, dict) and isinstance(data.get("pattern"), list):
             return {**data, "pattern": {"kind": "parameters", "cells": data["pattern"]}}
         return data
@@ -296,21 +294,19 @@ class Camera(Settings):
         if psi is not None:
             required(psi, ImagingMatrix, "psi", "the camera's Psi, camera.psi(size)")
         psi = self.psi((light_field.shape[2], light_field.shape[3])) if psi is None else psi
-        camera = self if exposure_s is None else self._exposed(exposure_s)
+        camera = self if exposure_s is None else self.with_exposures(exposure_s)
         return camera.read_out(psi.forward(light_field), seed)
 
-    def _exposed(self, exposure_s: ArrayLike) -> Camera:
-        """Return the camera with other exposures; raises ArgumentError."""
+    def with_exposures(self, exposure_s: ArrayLike) -> Camera:
+        """Return the camera with other exposures, of every shot or of each; ArgumentError."""
         takes = f"seconds, of every shot or of each of {len(self.shots)}"
         given = numbers_of(np.atleast_1d(exposure_s), "exposure_s", takes)
         inside = (given > SHORTEST) & (given < LONGEST)
         if given.shape not in ((1,), (len(self.shots),)) or not inside.all():
             raise refusal(exposure_s, "exposure_s", takes)
-        seconds = np.broadcast_to(given, len(self.shots)).tolist()
-        return self.model_copy(update={"shots": tuple(
-            shot.model_copy(update={"exposure_s": each})
-            for shot, each in zip(self.shots, seconds, strict=True)
-        )})  # fmt: skip
+        shots = zip(self.shots, np.broadcast_to(given, len(self.shots)).tolist(), strict=True)
+        timed = tuple(shot.model_copy(update={"exposure_s": each}) for shot, each in shots)
+        return self.model_copy(update={"shots": timed})
 
     def read_out(
         self, noise_free: NDArray[np.floating], seed: int | np.random.Generator = 0
@@ -339,12 +335,10 @@ class Camera(Settings):
         except CameraError as fault:
             return figure_html(f"{self!r}: {fault}", {})
         masks = {
-            f"mask '{name}', cells of {plate.cell_um:g} um at {plate.distance_mm:g} mm": middle(
-                plate.cells[0]
-            )
+            f"mask '{name}' at {plate.distance_mm:g} mm": middle(plate.cells[0])
             for name, plate in plates.items()
         }
-        return figure_html(repr(self), {**masks, **shadow_pictures(psi.weights, psi.colour)})
+        return figure_html(repr(self), masks | shadow_pictures(psi.weights, psi.colour))
 
     def __repr__(self) -> str:
         shots, pictures = len(self.shots), grid_name(self.view_axes, self.views)
@@ -440,11 +434,8 @@ def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
     count = len(camera.shots)
     if any(mask.pattern.frame_count(count) > 1 for mask in camera.masks.values()):
         return ""
-    exposures_s = camera.exposures_s()
-    chosen = [
-        camera.shots[shot].model_copy(update={"exposure_s": float(exposures_s[shot])})
-        for shot in shots
-    ]
+    timed = camera.with_exposures(camera.exposures_s())
+    chosen = [timed.shots[shot] for shot in shots]
     return camera.model_copy(update={"shots": tuple(chosen)}).model_dump_json()
 
 

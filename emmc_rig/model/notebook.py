@@ -14,18 +14,13 @@ from emmc_rig.model.srgb import codes_of, srgb_of
 
 Array = NDArray[np.floating]
 KINDS = {
-    ".png": "image/png",
-    ".jpg": "image/jpeg",
-    ".svg": "image/svg+xml",
-    ".webp": "image/webp",
-}
+    ".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml", ".webp": "image/webp"
+}  # fmt: skip
 WIDE_PX, LONGEST_PX = 215, 645
-"""Of a picture on the page; of its file, which a screen of three pixels for each of the page's
-shows. Four pictures fit side by side into a notebook."""
+"""Of a picture on the page, where four fit side by side, and of its file, for fine screens."""
 MIDDLE = 48, 64
 """Rows and columns that are shown where single pixels count."""
-MOST_SHOTS = 3
-UNUSABLE = 0.6, 0.0, 0.0
+MOST_SHOTS, UNUSABLE = 3, (0.6, 0.0, 0.0)
 
 
 def data_address(data: bytes, kind: str) -> str:
@@ -42,10 +37,7 @@ def picture_address(image: NDArray[np.uint8], extension: str, *options: int) -> 
 
 
 def figure_html(caption: str, pictures: Mapping[str, Array]) -> str:
-    """Return pictures side by side, each below its title, and a caption below them all.
-
-    pictures: linear light by title, (y, x) or (y, x, 3); 1 is white.
-    """
+    """Return pictures of linear light, (y, x) or (y, x, 3), below their titles, and a caption."""
     shown = "".join(
         f'<figure style="display:inline-block;margin:0 8px 4px 0;vertical-align:top">'
         f'<figcaption style="font-size:12px;width:{WIDE_PX}px">{html.escape(title)}</figcaption>'
@@ -68,33 +60,20 @@ def _address(values: Array) -> str:
 
 def middle(values: NDArray) -> NDArray:
     """Return the middle MIDDLE rows and columns of (y, x, ...)."""
-    return values[tuple(
-        slice(max(0, (have - want) // 2), max(0, (have - want) // 2) + want)
-        for have, want in zip(values.shape, MIDDLE, strict=False)
-    )]  # fmt: skip
-
-
-def stretched(values: Array) -> Array:
-    """Return finite values of [least, most] as [0, 1]; others are 0."""
-    finite = np.isfinite(values)
-    if not finite.any():
-        return np.zeros_like(values)
-    low, high = float(values[finite].min()), float(values[finite].max())
-    return np.where(finite, (values - low) / max(high - low, 1e-12), 0)
+    top, left = (max(0, (values.shape[k] - MIDDLE[k]) // 2) for k in (0, 1))
+    return values[top : top + MIDDLE[0], left : left + MIDDLE[1]]
 
 
 def light_field_pictures(light_field: Array, disparity: Array | None) -> dict[str, Array]:
     """Return the centre view, the epipolar image of its middle row, and the disparity if known."""
     v, u, rows = (count // 2 for count in light_field.shape[:3])
     lines = light_field[v, :, rows]
-    high = max(1, lines.shape[1] // (4 * len(lines)))
-    pictures = {
-        f"view ({v}, {u})": light_field[v, u],
-        f"epipolar image of row {rows}": np.repeat(lines, high, axis=0),
-    }
+    lines = np.repeat(lines, max(1, lines.shape[1] // (4 * len(lines))), axis=0)
+    pictures = {f"view ({v}, {u})": light_field[v, u], f"epipolar image of row {rows}": lines}
     if disparity is not None:
-        ends = f"{np.nanmin(disparity):.2g} (black) to {np.nanmax(disparity):.2g}"
-        pictures[f"disparity {ends}"] = stretched(disparity)
+        low, high = float(np.nanmin(disparity)), float(np.nanmax(disparity))
+        shown = np.nan_to_num((disparity - low) / max(high - low, 1e-12))
+        pictures[f"disparity {low:.2g} (black) to {high:.2g}"] = shown
     return pictures
 
 
@@ -105,9 +84,8 @@ def frame_pictures(readings: Array, usable: NDArray[np.bool_]) -> dict[str, Arra
     pictures = {}
     for shot in range(min(len(readings), MOST_SHOTS)):
         grey = np.repeat((readings[shot] / white)[..., None], 3, axis=-1)
-        pictures[f"shot {shot + 1}, white is {white:.2g}"] = np.where(
-            usable[shot][..., None], grey, UNUSABLE
-        )
+        shown = np.where(usable[shot][..., None], grey, UNUSABLE)
+        pictures[f"shot {shot + 1}, white is {white:.2g}"] = shown
     return pictures
 
 
@@ -117,9 +95,8 @@ def shadow_pictures(weights: Array, colour: NDArray[np.uint8] | None) -> dict[st
     weights: (shot, v, u, y, stored colour, x). colour: (shot, y, x), of one stored colour.
     """
     _, rows, columns = weights.shape[:3]
-    views = {
-        (v, u): middle(np.moveaxis(weights[0, v, u], 1, 2)) for v, u in np.ndindex(rows, columns)
-    }
+    grid = np.ndindex(rows, columns)
+    views = {place: middle(np.moveaxis(weights[0, *place], 1, 2)) for place in grid}
     opened = [place for place, values in views.items() if values.any()] or list(views)
     inner = min(opened, key=lambda place: np.hypot(place[0] - rows // 2, place[1] - columns // 2))
     seen = {f"view {place}": views[place] for place in (opened[0], inner)}

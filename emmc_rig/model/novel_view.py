@@ -161,26 +161,16 @@ def all_in_focus(light_field: Array, disparity: Array) -> NDArray[np.float32]:
     disparity: (y, x) of the centre view, finite.
     """
     y, x = np.mgrid[: light_field.shape[2], : light_field.shape[3]].astype(np.float32)
-    middle = tuple(count // 2 for count in light_field.shape[:2])
-    seen = [
-        cv2.remap(
-            np.ascontiguousarray(light_field[v, u], np.float32),
-            x + disparity * np.float32(u - middle[1]),
-            y + disparity * np.float32(v - middle[0]),
-            cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE,
-        )
-        for v, u in np.ndindex(light_field.shape[:2])
-        if (v, u) != middle
-    ]  # fmt: skip
-    centre = centre_view(light_field)
-    apart = [np.square(view - centre).sum(axis=-1) for view in seen]
-    typical = np.float32(2 * np.median(apart) + 1e-12)
-    total, weights = centre.astype(np.float32), np.ones(disparity.shape, np.float32)
-    for view, square in zip(seen, apart, strict=True):
-        weight = np.exp(-square / typical)
-        total += weight[..., None] * view
-        weights += weight
-    return np.clip(total / weights[..., None], 0, 1)
+    views, at = light_field.shape[:2], []
+    for v, u in np.ndindex(views):
+        down, right = np.float32(v - views[0] // 2), np.float32(u - views[1] // 2)
+        view = np.ascontiguousarray(light_field[v, u], np.float32)
+        place = x + disparity * right, y + disparity * down
+        at.append(cv2.remap(view, *place, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    seen = np.stack(at)
+    apart = np.square(seen - centre_view(light_field)).sum(axis=-1, keepdims=True)
+    weights = np.exp(-apart / np.float32(2 * np.median(apart) + 1e-12))
+    return np.clip((weights * seen).sum(axis=0) / weights.sum(axis=0), 0, 1)
 
 
 def centre_disparity(light_field: Array, disparity: Array | None) -> NDArray[np.float32]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from emmc_rig.model.camera import Camera
 
 Array = NDArray[np.floating]
+ABOVE_0 = "a distance from the lens above 0"
 
 
 @dataclass(frozen=True)
@@ -40,31 +41,28 @@ class Optics:
             return np.where(nearness <= 0, np.inf, 1 / nearness)
 
     def sigma_mm(self, depth_mm: Array, disparity_sigma: Array) -> Array:
-        """Return the deviation of depths by that of disparity, z^2 p / (a D) times as large."""
+        """Return the deviation of depths by that of disparity."""
         return np.square(depth_mm) * self.per_px * disparity_sigma
 
     def disparity_of(self, depth_mm: float) -> float:
-        """Return the disparity of a depth, pixels per view step."""
+        """Return the disparity of a depth, pixels per view step; raises ArgumentError."""
+        if depth_mm <= 0:
+            raise refusal(depth_mm, "depth_mm", ABOVE_0)
         return (1 / depth_mm - 1 / self.focus_mm) / self.per_px
 
 
 def optics_of(camera: Camera | None, focus_mm: float | None) -> Optics:
-    """Return the optics that a camera describes; raises CameraError, which says what is missing.
-
-    focus_mm: in place of the camera's.
-    """
+    """Return the optics of a camera, or with another focus; CameraError names what is missing."""
     if focus_mm is None and camera is not None:
         focus_mm = camera.lens.focus_mm
     if camera is None or focus_mm is None:
-        unknown = {
-            "lens.distance_mm, lens.aperture_cell_mm and sensor.sample_pitch_um of a camera, "
-            "camera=emmc_rig.camera(...)": camera is None,
-            "the distance from the lens to what is sharp, focus_mm=... or lens.focus_mm of the "
-            "camera's file": focus_mm is None,
-        }
-        missing = "; and ".join(name for name, is_missing in unknown.items() if is_missing)
-        raise CameraError(f"depth in mm needs {missing}")
+        of_camera = "lens.distance_mm, lens.aperture_cell_mm and sensor.sample_pitch_um, camera=..."
+        sharp = (
+            "the distance from the lens to what is sharp, focus_mm=... or lens.focus_mm of a file"
+        )
+        missing = [of_camera] * (camera is None) + [sharp] * (focus_mm is None)
+        raise CameraError(f"depth in mm needs {'; and '.join(missing)}")
     if not (isinstance(focus_mm, Real) and focus_mm > 0):
-        raise refusal(focus_mm, "focus_mm", "a distance from the lens above 0")
+        raise refusal(focus_mm, "focus_mm", ABOVE_0)
     lens, pitch_mm = camera.lens, camera.sensor.sample_pitch_um * 1e-3
     return Optics(focus_mm, pitch_mm / (lens.aperture_cell_mm * lens.distance_mm))

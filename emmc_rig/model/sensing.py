@@ -571,8 +571,7 @@ class Psi(PsiLayout):
         return matrix
 
 
-ImagingMatrix = Psi
-"""The name of the class inside of this program."""
+ImagingMatrix = Psi  # its name inside of this program
 
 
 @dataclass(frozen=True, eq=False)
