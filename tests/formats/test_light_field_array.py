@@ -115,6 +115,11 @@ def test_the_numbers_that_depth_lacks_are_named_in_one_line(
     assert "\n" not in str(refused.value)
 
 
+def test_a_camera_without_focus_is_described_and_hashed_as_before():
+    assert "focus_mm" not in emmc.camera("rgbw-mono").model_dump_json()
+    assert '"focus_mm":700' in emmc.camera(CAMERA).model_dump_json()
+
+
 def test_all_in_focus_has_less_noise_and_no_ghosts(scene):
     noisy, light = sheared(1.25, noise=0.03)
     taken = emmc.scene(noisy)
