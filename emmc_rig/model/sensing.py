@@ -140,8 +140,8 @@ class Psi(PsiLayout):
     """Psi in memory, an operator.
 
     weights: (shot, v, u, y, stored colour, x), float32 or float64. One stored colour where every
-        pixel sees one colour only, else three. Of a Psi larger than memory an HDF5 dataset: then
-        it is saved and looked at, view by view, and no operator.
+    pixel sees one colour only, else three. Of a Psi larger than memory an HDF5 dataset: then
+    it is saved and looked at, view by view, and no operator.
     colour: (shot, y, x) uint8, the colour stored there; None when three are stored.
     binning: k; a pixel sums k x k samples.
     camera_json: the description of the camera, or "" when unknown.
