@@ -20,7 +20,7 @@ def find_camera(spec: str | Path | Mapping[str, Any] | Camera, shots: int | None
 
     Args:
         spec: a shipped camera's name, the path of a YAML file, a dict with the keys of such a
-            file, or a camera. In a dict, what a file lists may be arrays: the cells of a mask are
+            file, or a camera. In a dict, what a file lists may be arrays: a mask's pattern is
             (row, column) or (row, column, 3), transmittances in [0, 1], or booleans.
         shots: how many (default: the camera's own).
 
@@ -37,8 +37,7 @@ def find_camera(spec: str | Path | Mapping[str, Any] | Camera, shots: int | None
     >>> emmc.camera({"title": "no mask", "sensor": {"cfa": "mono"}})
     Camera('no mask', 1 shot, 5x5 views, mono, 0 masks)
     >>> cells = np.random.default_rng(0).random((64, 80)) < 0.5
-    >>> pattern = {"kind": "parameters", "cells": cells}
-    >>> code = {"distance_mm": 1.0, "cell_um": 24, "pattern": pattern}
+    >>> code = {"distance_mm": 1.0, "cell_um": 24, "pattern": cells}
     >>> emmc.camera({"title": "mine", "masks": {"code": code}}).psi((24, 32))
     Psi(1 shot, 5x5 views, 24x32, mono, 0.23 MB)
     """

@@ -57,8 +57,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
         raise AppError(f"no folder or file '{spec}', and no built-in scene: {near}")
     else:
         scene = open_scene(spec, size)
-        light_field, caption, metrics = scene.light_field, scene.provenance, {}
-        maps = {} if scene.disparity_px is None else {"disparity": scene.disparity_px}
+        light_field, caption, maps, metrics = scene.light_field, scene.provenance, scene.maps, {}
     true = None
     if truth is not None:
         true = _true(truth, light_field.shape, metrics)

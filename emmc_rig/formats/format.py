@@ -125,13 +125,13 @@ class Format:
             )
 
 
-def extra_module(name: str, what: str) -> ModuleType:
-    """Return a package of the extra `formats`; raises AppError where it is not installed."""
+def extra_module(name: str, what: str, extra: str = "formats") -> ModuleType:
+    """Return a package of an extra; raises AppError where it is not installed."""
     try:
         return import_module(name)
     except ImportError:
-        package = name.replace("_", "-")
-        raise AppError(f'{what} needs {package}: pip install "emmc-rig[formats]"') from None
+        package = name.partition(".")[0].replace("_", "-")
+        raise AppError(f'{what} needs {package}: pip install "emmc-rig[{extra}]"') from None
 
 
 def write_picture(path: Path, rgb: NDArray) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from emmc_rig.formats.light_field_array import LightFieldArray
 from emmc_rig.formats.registry import FORMATS
 from emmc_rig.model.arguments import NAMES, numbers_of, pair_of, required
 from emmc_rig.model.errors import SceneError, ViewOrderWarning, did_you_mean
@@ -24,6 +25,7 @@ from emmc_rig.model.lightfield import (
     load_views,
     shifted,
 )
+from emmc_rig.model.notebook import figure_html, light_field_pictures
 from emmc_rig.model.view_axes import ANGLES, shows_parallax
 from emmc_rig.model.view_order import ViewOrder, order_of
 from emmc_rig.simulators.raycaster import World
@@ -39,12 +41,12 @@ BY_PARALLAX = "@by-parallax"
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(LightFieldArray):
     """A light field (v, u, y, x, 3) with its origin, and its disparity if known.
 
     `disparity_px` is (y, x), pixels per view step, of the centre view. Measured scenes have none,
     nor have the truths of simulated captures.
-    NumPy takes a scene as its light field: `psi @ scene`.
+    NumPy takes a scene as its light field: `psi @ scene`, `scene[2, 2]`.
     """
 
     name: str
@@ -62,8 +64,13 @@ class Scene:
         """Rows and columns of views."""
         return self.light_field.shape[0], self.light_field.shape[1]
 
-    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.light_field, dtype=dtype, copy=copy)
+    @property
+    def maps(self) -> dict[str, np.ndarray]:
+        """The disparity, by that name, if it is known."""
+        return {} if self.disparity_px is None else {"disparity": self.disparity_px}
+
+    def _repr_html_(self) -> str:
+        return figure_html(repr(self), light_field_pictures(self.light_field, self.disparity_px))
 
     def __repr__(self) -> str:
         (v, u), (rows, columns) = self.views, self.size

@@ -65,6 +65,17 @@ def numbers_of(value: object, name: str, takes: str) -> NDArray:
     return array
 
 
+def light_field_remedy(given: NDArray) -> str:
+    """Return how codes or grey make a light field, as the end of a line; "" for other arrays."""
+    steps = []
+    if given.ndim == 4 or given.shape[4:] == (1,):
+        steps.append(f"scene{'[..., None]' * (given.ndim == 4)}.repeat(3, axis=-1) of grey")
+    if given.dtype.kind in "iu":
+        full = np.iinfo(given.dtype).max
+        steps.append(f"scene / {full} of linear codes, (scene / {full}) ** 2.2 of a picture's")
+    return f": {', and '.join(steps)}" if steps else ""
+
+
 def _described(value: object) -> str:
     """Return what a value is, short enough for a line."""
     if value is None or isinstance(value, (str, Real, os.PathLike)):

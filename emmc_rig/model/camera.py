@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from emmc_rig.model.arguments import numbers_of, pair_of, refusal, required
+from emmc_rig.model.arguments import light_field_remedy, numbers_of, pair_of, refusal, required
 from emmc_rig.model.errors import CameraError, SensingError
 from emmc_rig.model.frames import SimulatedFrames
 from emmc_rig.model.geometry import (
@@ -62,13 +62,17 @@ class Lens(Settings):
     pupil: Pupil | None = Field(
         default=None, description="what is open of the views; None: all that the cells are"
     )
+    focus_mm: Positive | None = Field(
+        default=None, description="from the lens to what is sharp; for depth in mm"
+    )
 
     @model_serializer(mode="wrap")
     def _as_before(self, described: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Return what describes the lens; without a pupil as earlier versions hashed it."""
+        """Return what describes the lens; without unknown keys, as earlier versions hashed it."""
         plain = described(self)
-        if self.pupil is None:
-            plain.pop("pupil", None)
+        for name in ("pupil", "focus_mm"):
+            if getattr(self, name) is None:
+                plain.pop(name, None)
         return plain
 
     @property
@@ -111,6 +115,17 @@ class Mask(Settings):
     cell_um: Positive
     pattern: AnyPattern
     spare_cells: int = Field(default=8, ge=0, description="beyond the beam, for a misplaced mask")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _placed(cls, data: object) -> object:
+        """Refuse cells alone, and take those of a pattern as they are."""
+        if isinstance(data, list):
+            known = "{'distance_mm': ..., 'cell_um': ..., 'pattern': cells}"
+            raise ValueError(f"cells alone do not say where the mask is: {known}")
+        if isinstance(data, dict) and isinstance(data.get("pattern"), list):
+            return {**data, "pattern": {"kind": "parameters", "cells": data["pattern"]}}
+        return data
 
 
 class Shot(Settings):
@@ -260,24 +275,38 @@ class Camera(Settings):
         scene: ArrayLike,
         seed: int | np.random.Generator = 0,
         psi: ImagingMatrix | None = None,
+        exposure_s: ArrayLike | None = None,
     ) -> SimulatedFrames:
         """Return the frames of a light field (v, u, y, x, c), with the sensor's noise (eq. 14).
 
         psi: the camera's, where it is at hand; built otherwise. What the same Psi reconstructs
         looks better than a measurement would: a rig, simulated or real, has its own geometry.
-        Raises ArgumentError for another type of scene, seed or Psi.
+        exposure_s: seconds of every shot, or of each; None: as the camera says.
+        Raises ArgumentError for another type of scene, seed, Psi or exposure.
         """
         takes = "a scene, or a light field, a floating array (v, u, y, x, 3) in [0, 1]"
         light_field = numbers_of(scene, "scene", takes)
-        if light_field.ndim != 5 or light_field.dtype.kind != "f":
-            raise refusal(scene, "scene", takes)
+        if light_field.ndim != 5 or light_field.dtype.kind != "f" or light_field.shape[4] != 3:
+            raise refusal(scene, "scene", f"{takes}{light_field_remedy(light_field)}")
         required(
             seed, (int, np.random.Generator), "seed", "a whole number, or a generator of NumPy"
         )
         if psi is not None:
-            required(psi, ImagingMatrix, "psi", "the camera's imaging matrix, camera.psi(size)")
+            required(psi, ImagingMatrix, "psi", "the camera's Psi, camera.psi(size)")
         psi = self.psi((light_field.shape[2], light_field.shape[3])) if psi is None else psi
-        return self.read_out(psi.forward(light_field), seed)
+        camera = self if exposure_s is None else self.with_exposures(exposure_s)
+        return camera.read_out(psi.forward(light_field), seed)
+
+    def with_exposures(self, exposure_s: ArrayLike) -> Camera:
+        """Return the camera with other exposures, of every shot or of each; ArgumentError."""
+        takes = f"seconds, of every shot or of each of {len(self.shots)}"
+        given = numbers_of(np.atleast_1d(exposure_s), "exposure_s", takes)
+        inside = (given > SHORTEST) & (given < LONGEST)
+        if given.shape not in ((1,), (len(self.shots),)) or not inside.all():
+            raise refusal(exposure_s, "exposure_s", takes)
+        shots = zip(self.shots, np.broadcast_to(given, len(self.shots)).tolist(), strict=True)
+        timed = tuple(shot.model_copy(update={"exposure_s": each}) for shot, each in shots)
+        return self.model_copy(update={"shots": timed})
 
     def read_out(
         self, noise_free: NDArray[np.floating], seed: int | np.random.Generator = 0
@@ -295,6 +324,21 @@ class Camera(Settings):
 
     def __str__(self) -> str:
         return repr(self)
+
+    def _repr_html_(self) -> str:
+        from emmc_rig.model.notebook import MIDDLE, figure_html, middle, shadow_pictures
+
+        k = self.sensor.binning
+        size = -(-MIDDLE[0] // k) * k, -(-MIDDLE[1] // k) * k
+        try:
+            plates, psi = draw_plates(self, size), self.psi(size)
+        except CameraError as fault:
+            return figure_html(f"{self!r}: {fault}", {})
+        masks = {
+            f"mask '{name}' at {plate.distance_mm:g} mm": middle(plate.cells[0])
+            for name, plate in plates.items()
+        }
+        return figure_html(repr(self), masks | shadow_pictures(psi.weights, psi.colour))
 
     def __repr__(self) -> str:
         shots, pictures = len(self.shots), grid_name(self.view_axes, self.views)
@@ -363,7 +407,7 @@ def load_camera(path: Path) -> Camera:
 
 def camera_of(psi: PsiLayout) -> Camera:
     """Return the camera that a Psi says it is of; raises SensingError where that is no camera."""
-    source = "the imaging matrix's camera"
+    source = "Psi's camera"
     described = parse_json(psi.camera_json, source, SensingError)
     return validated(Camera, described, source, SensingError)
 
@@ -390,11 +434,8 @@ def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
     count = len(camera.shots)
     if any(mask.pattern.frame_count(count) > 1 for mask in camera.masks.values()):
         return ""
-    exposures_s = camera.exposures_s()
-    chosen = [
-        camera.shots[shot].model_copy(update={"exposure_s": float(exposures_s[shot])})
-        for shot in shots
-    ]
+    timed = camera.with_exposures(camera.exposures_s())
+    chosen = [timed.shots[shot] for shot in shots]
     return camera.model_copy(update={"shots": tuple(chosen)}).model_dump_json()
 
 

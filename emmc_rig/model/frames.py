@@ -92,6 +92,11 @@ class Frames:
     def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self.readings, dtype=dtype, copy=copy)
 
+    def _repr_html_(self) -> str:
+        from emmc_rig.model.notebook import figure_html, frame_pictures  # with OpenCV
+
+        return figure_html(repr(self), frame_pictures(self.readings, self.usable))
+
     def __repr__(self) -> str:
         shots, rows, columns = self.shape
         return (

@@ -16,6 +16,7 @@ import cv2
 import h5py
 import numpy as np
 
+from emmc_rig.model.arguments import light_field_remedy
 from emmc_rig.model.bands import in_views
 from emmc_rig.model.decoding.stored import light_of, read_codes, read_views
 from emmc_rig.model.errors import SceneError
@@ -50,16 +51,18 @@ def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:
         SceneError: wrong shape or type, or a sample that is not finite or not in [0, 1].
     """
     lf = np.asarray(lf)
+    remedy = light_field_remedy(lf)
     if lf.ndim != 5:
-        raise SceneError(f"{source}: shape {lf.shape} is not (v, u, y, x, c)")
+        raise SceneError(f"{source}: shape {lf.shape} is not (v, u, y, x, c){remedy}")
     if lf.shape[0] * lf.shape[1] < 2:
         raise SceneError(f"{source}: {lf.shape[0]}x{lf.shape[1]} views, needs two or more")
     if lf.shape[4] != 3:
-        raise SceneError(f"{source}: {lf.shape[4]} colours, needs 3 (RGB)")
+        raise SceneError(f"{source}: {lf.shape[4]} colours, needs 3 (RGB){remedy}")
     if lf.size == 0:
         raise SceneError(f"{source}: views of {lf.shape[2]}x{lf.shape[3]} pixels hold nothing")
     if not np.issubdtype(lf.dtype, np.floating):
-        raise SceneError(f"{source}: values are {lf.dtype}, needs floating values in [0, 1]")
+        needs = f"needs floating values in [0, 1]{remedy}"
+        raise SceneError(f"{source}: values are {lf.dtype}, {needs}")
     if not (lf.min() >= 0 and lf.max() <= 1):
         wrong = ~((lf >= 0) & (lf <= 1))
         v, u, y, x, c = (int(i) for i in np.unravel_index(wrong.argmax(), lf.shape))

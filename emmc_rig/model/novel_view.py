@@ -150,6 +150,29 @@ def between(light_field: Array, disparities: Array, v: float, u: float) -> Array
     return total / weights[..., None]
 
 
+def all_in_focus(light_field: Array, disparity: Array) -> NDArray[np.float32]:
+    """Return the centre view (y, x, c) with less noise: the mean of all views along its disparity.
+
+        mean = sum_k w_k L_k / sum_k w_k,   w_k = exp(-|L_k - L_0|^2 / (2 m)),
+
+    with L_k what view k has at each point of the centre view L_0, and m the median of |L_k - L_0|^2
+    over views and points: surfaces that a view does not see, and reflections, count little.
+
+    disparity: (y, x) of the centre view, finite.
+    """
+    y, x = np.mgrid[: light_field.shape[2], : light_field.shape[3]].astype(np.float32)
+    views, at = light_field.shape[:2], []
+    for v, u in np.ndindex(views):
+        down, right = np.float32(v - views[0] // 2), np.float32(u - views[1] // 2)
+        view = np.ascontiguousarray(light_field[v, u], np.float32)
+        place = x + disparity * right, y + disparity * down
+        at.append(cv2.remap(view, *place, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    seen = np.stack(at)
+    apart = np.square(seen - centre_view(light_field)).sum(axis=-1, keepdims=True)
+    weights = np.exp(-apart / np.float32(2 * np.median(apart) + 1e-12))
+    return np.clip((weights * seen).sum(axis=0) / weights.sum(axis=0), 0, 1)
+
+
 def centre_disparity(light_field: Array, disparity: Array | None) -> NDArray[np.float32]:
     """Return a finite disparity (y, x) of the centre view: the given one, or an estimate."""
     if disparity is None or disparity.shape != centre_view(light_field).shape[:2]:

@@ -138,12 +138,12 @@ class PsiLayout:
 
 
 @dataclass(frozen=True, eq=False)
-class ImagingMatrix(PsiLayout):
+class Psi(PsiLayout):
     """Psi in memory, an operator.
 
     weights: (shot, v, u, y, stored colour, x), float32 or float64. One stored colour where every
-        pixel sees one colour only, else three. Of a Psi larger than memory an HDF5 dataset: then
-        it is saved and looked at, view by view, and no operator.
+    pixel sees one colour only, else three. Of a Psi larger than memory an HDF5 dataset: then
+    it is saved and looked at, view by view, and no operator.
     colour: (shot, y, x) uint8, the colour stored there; None when three are stored.
     binning: k; a pixel sums k x k samples.
     camera_json: the description of the camera, or "" when unknown.
@@ -183,7 +183,7 @@ class ImagingMatrix(PsiLayout):
         if self.size[0] % self.binning or self.size[1] % self.binning:
             raise SensingError(f"pixels of {self.binning}^2 samples do not divide {self.size}")
         if not all(np.isfinite(plane).all() for plane in self.view_planes()):
-            raise SensingError("the imaging matrix has entries that are not finite")
+            raise SensingError("Psi has entries that are not finite")
 
     def __repr__(self) -> str:
         shots, (v, u), (rows, columns) = self.shots, self.views, self.size
@@ -194,6 +194,11 @@ class ImagingMatrix(PsiLayout):
             f"Psi({shots} shot{'s' * (shots > 1)}, {v}x{u} views{named}, {rows}x{columns}, "
             f"{self._sensor()}, {memory})"
         )
+
+    def _repr_html_(self) -> str:
+        from emmc_rig.model.notebook import figure_html, shadow_pictures  # with OpenCV
+
+        return figure_html(repr(self), shadow_pictures(self.weights, self.colour))
 
     def _sensor(self) -> str:
         """Return the name of the colour filter tile, or how many colours a pixel sees."""
@@ -527,7 +532,7 @@ class ImagingMatrix(PsiLayout):
     def relative_difference(self, reference: ImagingMatrix) -> float:
         """Return |Psi - reference| / |reference| in the Frobenius norm."""
         if self.weights.shape != reference.weights.shape:
-            raise SensingError("only imaging matrices of the same camera and size compare")
+            raise SensingError("only Psi of the same camera and size compare")
         difference = np.linalg.norm((self.weights - reference.weights).ravel())
         return float(difference / np.linalg.norm(reference.weights.ravel()))
 
@@ -548,7 +553,7 @@ class ImagingMatrix(PsiLayout):
                 file["weights"] = self.weights
                 self.describe(file)
         except OSError as fault:
-            raise SensingError(f"{path}: the imaging matrix cannot be written ({fault})") from fault
+            raise SensingError(f"{path}: Psi cannot be written ({fault})") from fault
 
     def describe(self, file: h5py.File) -> None:
         """Write what makes a file that holds the weights one of Psi."""
@@ -560,10 +565,10 @@ class ImagingMatrix(PsiLayout):
     @classmethod
     def load(cls, path: str | Path) -> ImagingMatrix:
         """Read a saved Psi; raises SensingError when it is not one, or damaged."""
-        path = path_of(path, "path", "the file of an imaging matrix")
+        path = path_of(path, "path", "the file of a Psi")
         with stored_arrays(path, SensingError, "measure Psi again") as stored:
             if stored.attributes.get("format") != FORMAT:
-                raise SensingError(f"{path}: not an imaging matrix of this program")
+                raise SensingError(f"{path}: not a Psi of this program")
             matrix = cls(
                 stored.array("weights"),
                 stored.array("colour") if "colour" in stored else None,
@@ -575,6 +580,9 @@ class ImagingMatrix(PsiLayout):
         if matrix.checksum() != expected:
             raise SensingError(f"{path}: damaged (its checksum differs); measure Psi again")
         return matrix
+
+
+ImagingMatrix = Psi  # its name inside of this program
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,7 +55,7 @@ from emmc_rig.store.shards import opened_array
 
 OnStep = Callable[[Progress], None]
 PSI_TAKES = (
-    "an imaging matrix: camera.psi(size), Psi.load(file), Psi.from_scipy(matrix, ...), or "
+    "a Psi: camera.psi(size), Psi.load(file), Psi.from_scipy(matrix, ...), or "
     "Psi.from_weights(weights)"
 )
 FRAMES_TAKES = "frames, or an array (shot, pixel_y, pixel_x) of real readings"
@@ -464,7 +464,7 @@ def open_frames(
     takes = "the folder of a session, or of frames with their Psi"
     folder = path_of(folder, "folder", takes)
     if psi is not None:
-        psi = path_of(psi, "psi", "the file of an imaging matrix, psi.h5")
+        psi = path_of(psi, "psi", "the file of a Psi, psi.h5")
     if folder.is_file():
         raise AppError(
             f"{folder}: a file; open_frames takes {takes}; readings of your own are given to "

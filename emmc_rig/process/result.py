@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.formats.format import Export
+from emmc_rig.formats.light_field_array import LightFieldArray
 from emmc_rig.model.arguments import path_of
-from emmc_rig.model.camera import camera_of, psi_of_shot
+from emmc_rig.model.camera import Camera, camera_of, psi_of_shot
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import one_line
@@ -102,7 +103,7 @@ def figures(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Result:
+class Result(LightFieldArray):
     """What `emmc_rig.reconstruct` returns.
 
     solved: what the method returned. verdict: whether to trust it, with reasons and remedies.
@@ -244,11 +245,11 @@ class Result:
         """
         from emmc_rig.report.report import ReportContent, write_report  # matplotlib loads for long
 
-        psi, frames = self._known("psi"), self._known("frames")
+        frames = self._known("frames")
         captured = f" of {Path(metrics['source']).resolve().name}" if "source" in metrics else ""
         content = ReportContent(
             **{"title": f"Light field{captured} by {self.method}", **shown},
-            described=camera_of(psi) if psi and psi.camera_json else None,
+            described=self._seen_by(),
             estimate=self.light_field,
             truth=truth,
             frames=None if frames is None else frames.readings,
@@ -257,6 +258,10 @@ class Result:
             source=source,
         )
         write_report(folder / REPORT, content)
+
+    def _seen_by(self) -> Camera | None:
+        psi = self._known("psi")
+        return camera_of(psi) if psi and psi.camera_json else None
 
     def _known(self, name: str) -> Any:
         """Return `psi` or `frames`; None where a saved result is without."""

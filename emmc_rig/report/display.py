@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.report.page import data_address
+from emmc_rig.model.notebook import picture_address
 
 Array = NDArray[np.floating]
 
@@ -62,21 +62,14 @@ def finite(values: Array) -> NDArray[np.float32]:
     return np.nan_to_num(values, nan=0.0, posinf=1.0, neginf=0.0)
 
 
-def _data_uri(image: NDArray[np.uint8], extension: str, *options: int) -> str:
-    done, encoded = cv2.imencode(extension, image, options)
-    if not done:
-        raise ValueError(f"cannot encode a picture of shape {image.shape} as {extension}")
-    return data_address(encoded.tobytes(), extension)
-
-
 def png_of(image: NDArray[np.uint8]) -> str:
     """A lossless picture as a data URL."""
-    return _data_uri(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
+    return picture_address(image, ".png", cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 
 def webp_of(image: NDArray[np.uint8], quality: int) -> str:
     """A small lossy picture as a data URL."""
-    return _data_uri(image, ".webp", cv2.IMWRITE_WEBP_QUALITY, quality)
+    return picture_address(image, ".webp", cv2.IMWRITE_WEBP_QUALITY, quality)
 
 
 def webp_quality(image: NDArray[np.uint8], most_bytes: int) -> int:
@@ -107,7 +100,7 @@ def sprite(views: NDArray[np.uint8], most_bytes: int, tile: int = TILE_MULTIPLE_
         picture = np.ascontiguousarray(picture[..., ::-1])  # OpenCV's channel order
     address = ""
     for quality in JPEG_QUALITIES:
-        address = _data_uri(
+        address = picture_address(
             picture,
             ".jpg",
             cv2.IMWRITE_JPEG_QUALITY,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 import re
 import shlex
@@ -13,17 +12,12 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from emmc_rig.model.notebook import data_address
 from emmc_rig.model.view_axes import axes_of, picture_name, shows_parallax
 from emmc_rig.reconstruction.verdict.rules import CONSISTENT
 from emmc_rig.store.results import stated_words, unmeasured_words, worse_words
 from emmc_rig.version import __version__
 
-KINDS = {
-    ".png": "image/png",
-    ".jpg": "image/jpeg",
-    ".svg": "image/svg+xml",
-    ".webp": "image/webp",
-}
 TEMPLATES = PackageLoader("emmc_rig.report")
 VERDICTS = {
     "trust": ("You can trust this light field", "good"),
@@ -216,11 +210,6 @@ def provenance_section(provenance: Mapping[str, object]) -> Section:
         body,
         about="What is needed to make this again: command, versions and settings.",
     )
-
-
-def data_address(data: bytes, kind: str) -> str:
-    """Return bytes as a data URL. kind: the suffix of such a file."""
-    return f"data:{KINDS[kind]};base64,{base64.b64encode(data).decode()}"
 
 
 def embedded(path: Path) -> str:

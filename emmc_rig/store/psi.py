@@ -41,7 +41,7 @@ class StoredPsi(PsiLayout):
             super().__init__(shape, None, binning, str(stored.attributes["camera"]), axes)
             self.checksum = str(stored.attributes["sha256"])
             if len(shape) != 6 or binning < 1:
-                raise SensingError(f"{path}: damaged (no shape of an imaging matrix); {AGAIN}")
+                raise SensingError(f"{path}: damaged (no shape of a Psi); {AGAIN}")
 
     def verify(self) -> None:
         """Raise SensingError when the file is damaged; reads all of it, a plane at a time."""
@@ -72,7 +72,7 @@ class StoredPsi(PsiLayout):
     def _opened(self) -> Iterator[Any]:
         with stored_in(self._path, SensingError, AGAIN) as stored:
             if stored.attributes.get("format") != FORMAT or "weights" not in stored:
-                raise SensingError(f"{self._path}: not an imaging matrix of this program")
+                raise SensingError(f"{self._path}: not a Psi of this program")
             yield stored
 
 

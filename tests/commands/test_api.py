@@ -287,7 +287,35 @@ MISTAKES = {
     "a misspelt key": (lambda t: api.camera({**CAMERA, "lense": {}}), "did you mean 'lens'"),
     "shots as text": (lambda t: api.camera("rgbw-mono", shots="2"), "shots: got '2'"),
     "a scene of nothing": (lambda t: api.scene(None), "scene: got None; it takes a name"),
-    "a scene of codes": (lambda t: api.scene(np.zeros((2, 2, 4, 4, 3), np.uint8)), "uint8"),
+    "a scene of codes": (
+        lambda t: api.scene(np.zeros((2, 2, 4, 4, 3), np.uint8)),
+        r"uint8, .*: scene / 255 of linear codes, \(scene / 255\) \*\* 2.2 of a picture's",
+    ),
+    "a grey scene": (
+        lambda t: api.scene(np.zeros((2, 2, 4, 4))),
+        r"\(v, u, y, x, c\): scene\[..., None\].repeat\(3, axis=-1\) of grey$",
+    ),
+    "a scene of one colour": (
+        lambda t: api.scene(np.zeros((2, 2, 4, 4, 1))),
+        r"needs 3 \(RGB\): scene.repeat\(3, axis=-1\) of grey$",
+    ),
+    "exposing codes": (
+        lambda t: api.camera("rgbw-mono").expose(np.zeros((5, 5, 24, 32, 3), np.uint16)),
+        "scene / 65535 of linear codes",
+    ),
+    "an exposure below 0": (
+        lambda t: api.camera("rgbw-mono").expose(t[0], exposure_s=-1),
+        "exposure_s: got -1; it takes seconds, of every shot or of each of 1",
+    ),
+    "an exposure too many": (
+        lambda t: api.camera("rgbw-bayer-2shots").expose(t[0], exposure_s=(1, 2, 3)),
+        "exposure_s: .* of each of 2",
+    ),
+    "a mask that is nowhere": (
+        lambda t: api.camera({**CAMERA, "masks": {"code": np.ones((9, 9))}}),
+        "masks.code: cells alone do not say where the mask is",
+    ),
+    "a Psi for frames": (lambda t: api.Frames(t[1], t[1], t[1]), "readings: got Psi of shape"),
     "a size of one side": (lambda t: api.scene("dark", size=24), "size: got 24; it takes rows"),
     "half a pixel": (lambda t: api.scene("dark", size=(24.5, 32)), "size: got tuple"),
     "a seed as text": (lambda t: api.scene("dark", size=(24, 32), seed="a"), "seed: got 'a'"),
@@ -429,7 +457,7 @@ MISTAKES = {
     "exposing a name": (lambda t: api.camera("rgbw-mono").expose("dark"), "scene: got 'dark'"),
     "a Psi of no camera": (
         lambda t: api.reconstruct(replace(t[1], camera_json="{}"), t[2].readings),
-        "the imaging matrix's camera: title: field required",
+        "Psi's camera: title: field required",
     ),
     "frames of lists": (lambda t: api.Frames([1], [1], [1]), "readings: got list"),
     "frames of two shapes": (

@@ -9,6 +9,8 @@ import itertools
 import re
 import runpy
 import shlex
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from matplotlib import pyplot
 from placed import files_of, listed
 from programs import done, program
 
+import emmc_rig as emmc
 from emmc_rig import cli
 from emmc_rig.commands.options import SIZE_VARIABLE
 from emmc_rig.process import session_calibration as calibrate_session
@@ -83,13 +86,17 @@ def test_no_line_that_is_a_command_is_passed_over(document):
     assert len(found) == len(lines) > 0
 
 
+def examples(page):
+    """Return a page's Python, by the heading above."""
+    return {
+        re.findall(r"^## (.*)$", page[: found.start()], re.M)[-1]: found["text"]
+        for found in BLOCK.finditer(page)
+        if found["language"] == "python"
+    }
+
+
 PAGE = ROOT / "docs" / "which-cameras.md"
-EXAMPLES = {
-    re.findall(r"^## (.*)$", PAGE.read_text()[: found.start()], re.M)[-1]: found["text"]
-    for found in BLOCK.finditer(PAGE.read_text())
-    if found["language"] == "python"
-}
-"""The page's Python, by the heading above."""
+EXAMPLES = examples(PAGE.read_text())
 
 
 @pytest.mark.parametrize("camera", EXAMPLES)
@@ -108,6 +115,55 @@ def test_every_camera_of_the_page_is_a_dozen_lines_that_run(camera, tmp_path, mo
         assert result.verdict.level != "do not use"
         frames = np.asarray(names["frames"])
         assert (names["psi"] @ result.light_field - frames).std() < 0.2 * frames.std()
+
+
+NOTEBOOK = (ROOT / "docs" / "notebook.md").read_text()
+
+
+def test_the_table_of_tasks_counts_their_lines_and_none_has_more_than_six():
+    listed = re.findall(r"^\| \[(.*)\]\(#[\w-]+\) \| (\d) \|$", NOTEBOOK, re.M)
+    counted = {
+        task: len(list(filter(None, text.splitlines())))
+        for task, text in examples(NOTEBOOK).items()
+    }
+    assert {task: int(lines) for task, lines in listed} == counted
+    assert max(counted.values()) <= 6
+    assert max(map(len, NOTEBOOK.splitlines())) <= 120
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of napari itself
+def test_every_task_of_a_notebook_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng, white, places = np.random.default_rng(0), np.ones((5, 5, 48, 64, 3)), [(0, 0), (270, 162)]
+    camera = emmc.camera("rgbw-bayer-1shot")
+
+    def board(**shot):
+        bench = emmc.camera({**camera.model_dump(), "shots": [shot]})
+        return np.concatenate([bench.expose(white, rng).frames_dn for _ in range(2)])
+
+    seen = [board(offset_um={"mask": place}) for place in (*places, (-200, 118))]
+    names: dict = {
+        "np": np,
+        "emmc": emmc,
+        "whiteboards": [board(masks=[]), *seen],
+        "darks": np.concatenate([camera.expose(0 * white, rng).frames_dn for _ in range(4)]),
+        "dn": camera.expose(emmc.scene("wide-disparity", size=(48, 64)), rng).frames_dn,
+    }
+    for task, text in examples(NOTEBOOK).items():
+        if task in ("napari", "xarray"):
+            if not find_spec(task):
+                continue
+            if task == "napari":  # without a window
+                napari = import_module(task)
+                monkeypatch.setattr(napari, "Viewer", napari.components.ViewerModel)
+        exec(compile(text, task, "exec"), names)
+    assert names["result"].verdict.level == names["measured"].verdict.level == "trust"
+    better = names["result"].compare(names["scene"])
+    assert better["psnr_db"] > better["replicate_psnr_db"]
+    assert names["psi"].relative_difference(camera.psi((48, 64))) < 0.03
+    np.testing.assert_array_equal(np.asarray(names["again"]), np.asarray(names["result"]))
+    pyplot.close("all")
 
 
 def test_every_camera_and_bench_is_drawn_as_the_script_draws_it(tmp_path):

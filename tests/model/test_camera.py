@@ -100,7 +100,8 @@ def test_a_misspelt_key_is_an_error_that_names_the_nearest_valid_one(tmp_path, p
 def test_a_key_like_no_other_is_answered_with_the_valid_ones(tmp_path):
     message = refusal(tmp_path, changed("lens", "xyzzy", 1))
     assert message == (
-        "unknown key 'lens.xyzzy': valid keys: aperture_cell_mm, aperture_fill, distance_mm, pupil"
+        "unknown key 'lens.xyzzy': valid keys: aperture_cell_mm, aperture_fill, distance_mm, "
+        "focus_mm, pupil"
     )
 
 
