@@ -31,6 +31,11 @@ the built-in scene `dark`, which has no edges, seems to have some in noise."""
 ALL_ALONG = 0.9
 """Share of its length over which a line of an edge is darker: 1 on these corners, 0.73 for a dark
 object that ends beside the picture's edge (dragons)."""
+PART = 0.2
+"""If a side has an edge, another side's outermost line is an edge, too, if it is dark over more of
+its length than each line within, by this share. For the lowest row of begonia (434x625) the share
+is 0.27, and leaving the row out gains 0.2 dB. Without the condition of another edge, 33 of 736
+crops of group A seem to have an edge, and the six crops measured lost 0.1 to 5 dB."""
 TINY = 1e-20
 
 
@@ -55,8 +60,8 @@ def _blurred(line: Array) -> Array:
     return np.asarray(out, dtype=np.float32).reshape(line.shape)
 
 
-def _is_dark(seen: Array, readings: Array) -> bool:
-    """Return whether the first of several lines is darker than the BESIDE lines after it.
+def _dark_share(seen: Array, readings: Array) -> float:
+    """Return the share of a first line's length where it is darker than the BESIDE lines after it.
 
     The lines within have the colours B(along, c) = sum(seen * readings) / sum(seen), blurred along
     the line, sums over line and shot. The first line reads seen . B if it is as bright. Where its
@@ -76,7 +81,7 @@ def _is_dark(seen: Array, readings: Array) -> bool:
     bright, missed = (
         _blurred((received * part).sum(axis=0)) for part in (expected, expected - readings[0])
     )
-    return float((missed > DARKER * bright).mean()) >= ALL_ALONG
+    return float((missed > DARKER * bright).mean())
 
 
 def dark_edges(
@@ -96,13 +101,21 @@ def dark_edges(
     seen = psi.picture_weights.reshape(shots, rows, k, columns, k, -1).sum(axis=(2, 4))
     seen, readings = np.where(usable[..., None], seen, 0), np.where(usable, frames, 0)
     widths = [0] * len(SIDES)
-    for number, side in enumerate(SIDES):
-        if side not in sides:
-            continue
+
+    def dark_share(number: int, line: int) -> float:
         axis, step = 1 + number // 2, -1 if number % 2 else 1
-        lines = [np.moveaxis(part, axis, 0)[::step] for part in (seen, readings)]
-        while widths[number] < BESIDE and _is_dark(*(part[widths[number] :] for part in lines)):
+        return _dark_share(*(np.moveaxis(a, axis, 0)[::step][line:] for a in (seen, readings)))
+
+    able = [number for number, side in enumerate(SIDES) if side in sides]
+    for number in able:
+        while widths[number] < BESIDE and dark_share(number, widths[number]) >= ALL_ALONG:
             widths[number] += 1
+    if any(widths):
+        # Rectified light fields end so at several sides, at some along a part of their length.
+        for number in able:
+            first, *within = (dark_share(number, line) for line in range(1 + BESIDE))
+            if not widths[number] and first - max(within) >= PART:
+                widths[number] = 1
     top, bottom, left, right = widths
     within = np.ones((rows, columns), dtype=bool)
     within[top : rows - bottom, left : columns - right] = False

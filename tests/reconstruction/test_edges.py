@@ -77,6 +77,24 @@ def test_a_dark_line_inside_a_brighter_one_is_no_edge(camera_psi):
     assert found_edges(camera_psi, noisy(camera_psi, light_field)) is None
 
 
+@pytest.mark.parametrize("columns", [0, 2])
+def test_a_line_dark_in_part_is_an_edge_where_another_side_has_one(camera_psi, columns):
+    light_field, _ = plane_scene(camera_psi, 1.5)
+    light_field[:, :, -1, 30:] *= 0.1
+    light_field[:, :, :, :columns] *= 0.1
+    edges = found_edges(camera_psi, noisy(camera_psi, light_field))
+    assert (None if edges is None else edges.widths) == ((0, 1, 2, 0) if columns else None)
+
+
+def test_a_shadow_that_deepens_to_the_border_is_no_edge_where_another_side_has_one(camera_psi):
+    light_field, _ = plane_scene(camera_psi, 1.5)
+    light_field[:, :, -8:, 30:] *= 0.7 ** np.arange(1, 9, dtype=np.float32)[:, None, None]
+    light_field[:, :, :, :2] *= 0.1
+    edges = found_edges(camera_psi, noisy(camera_psi, light_field))
+    assert edges is not None
+    assert edges.widths == (0, 0, 2, 0)
+
+
 def test_frames_too_small_to_tell_have_no_edges(coded_psi):
     psi = coded_psi("rggb", 1, 1, (28, 60), (3, 3))
     light_field = np.ones(psi.light_field_shape, dtype=np.float32)

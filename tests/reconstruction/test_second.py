@@ -53,6 +53,18 @@ def test_a_few_wide_patches_are_not_worth_a_second_search(survey, share, again):
     assert (found is not None) == again
 
 
+@pytest.mark.parametrize(
+    ("shots", "disparity", "again"), [(1, 4, False), (1, 5, True), (3, 4, True)]
+)
+def test_one_shot_of_a_large_picture_is_searched_again_for_wider_disparities(
+    survey, monkeypatch, shots, disparity, again
+):
+    monkeypatch.setattr(surveys, "WIDE_BESIDE", 18 / min(SIZE))
+    psi = build_imaging_matrix(find_camera(f"rgbw-bayer-{shots}shot{'s' * (shots > 1)}"), SIZE)
+    seen = replace(survey, given=replace(survey.given, psi=psi))
+    assert (searched_again(believing(seen, disparity), QUICK) is not None) == again
+
+
 def test_adaptive_fast_searches_once(survey):
     assert searched_again(believing(survey, 4.0), fast(AdaptiveSettings())) is None
 
