@@ -58,7 +58,7 @@ from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.camera import psi_layout
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.methods import DEFAULT_METHOD
 from emmc_rig.reconstruction.tv import TVSettings, reconstruct_tv
@@ -263,7 +263,7 @@ class Captured:
     usable: NDArray[np.bool_]
     truth: Array
 
-    def psnr(self, psi: ImagingMatrix) -> float:
+    def psnr(self, psi: Psi) -> float:
         """Return the PSNR of a reconstruction by total variation."""
         sigma = float(np.sqrt(self.variance[self.usable].mean()))
         result = reconstruct_tv(psi, even_frames(self.readings, sigma, self.usable), TVSettings())
@@ -285,13 +285,13 @@ def captured_scene(spec: str, settings: CalibrateSettings, known: Calibration) -
 
 
 @cache
-def _fitted(size: Size, seed: int) -> tuple[Outcome, ImagingMatrix]:
+def _fitted(size: Size, seed: int) -> tuple[Outcome, Psi]:
     """Return the calibration by the fitted mask, and the truth in the form of its Psi."""
     done = calibrate_simulated(settings_for(size, seed, route="mixed"))
     return done.found.outcome, _stored(done.true, done.found.psi)
 
 
-def _stored(true: Array, psi: ImagingMatrix) -> ImagingMatrix:
+def _stored(true: Array, psi: Psi) -> Psi:
     """Return true coefficients of three colours as the one colour that a Psi stores."""
     assert psi.colour is not None
     own = psi.colour[:, None, None, :, None, :].astype(np.int64)

@@ -18,7 +18,7 @@ from emmc_rig.calibration.placement import designed_placement
 from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.methods import installed_methods
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture, Trial
@@ -27,7 +27,7 @@ ERRORS = (("mask-shift", 0.5), ("mask-rotation", 0.5), ("mask-distance-error", 2
 QUICK = DriftSettings(blocks=60, coarse_blocks=24, block_px=6, disparity_steps=7)
 
 
-def mended(moved: Trial) -> ImagingMatrix:
+def mended(moved: Trial) -> Psi:
     """Return Psi as fitted to the readings, unchanged where no drift is detected."""
     psi = moved.psi
     camera = camera_of(psi)

@@ -26,7 +26,7 @@ from emmc_rig.captures.plan import Plan
 from emmc_rig.captures.run import CaptureRequest, planned_frames
 from emmc_rig.demo import simulated_session
 from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.process.calibrating import calibrate
 from emmc_rig.process.session_calibration import SessionCalibration
 from emmc_rig.progress import Watcher
@@ -72,7 +72,7 @@ def true_psi(camera: Camera, rig: Rig, bench: Bench) -> NDArray[np.float32]:
     return np.stack(found)
 
 
-def in_three_colours(values: Array, psi: ImagingMatrix) -> NDArray[np.float32]:
+def in_three_colours(values: Array, psi: Psi) -> NDArray[np.float32]:
     """Return values shaped as Psi's weights for all three colours: 0 where it stores none."""
     if psi.colour is None:
         return np.asarray(values, dtype=np.float32)
@@ -80,11 +80,11 @@ def in_three_colours(values: Array, psi: ImagingMatrix) -> NDArray[np.float32]:
     return np.where(own, values, 0).astype(np.float32)
 
 
-def _of_good(psi: ImagingMatrix, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _of_good(psi: Psi, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return good.repeat(psi.binning, axis=0).repeat(psi.binning, axis=1)[:, None, :]
 
 
-def true_error(psi: ImagingMatrix, true: Array, good: NDArray[np.bool_]) -> float:
+def true_error(psi: Psi, true: Array, good: NDArray[np.bool_]) -> float:
     """Return |Psi - true| / |true| in three colours over the good pixels, Frobenius.
 
     true: (shot, v, u, y, colour, x). A colour that Psi does not store counts as 0.

@@ -27,7 +27,7 @@ from emmc_rig.calibration.placement import SCALARS
 from emmc_rig.calibration.robust import deviation_of
 from emmc_rig.calibration.shadow import Shadow, ShadowMask
 from emmc_rig.calibration.whiteboard import Calibration
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 Array = NDArray[np.floating]
 SIGNIFICANT = 4.0
@@ -93,7 +93,7 @@ class _TurnedBoard:
 
 
 def board_over_angle(
-    psi: ImagingMatrix, turned: Mapping[float, Board], shadow: Shadow | None = None
+    psi: Psi, turned: Mapping[float, Board], shadow: Shadow | None = None
 ) -> BoardAngle:
     """Return the board's radiance from open whiteboards by the degrees it was turned.
 
@@ -149,9 +149,7 @@ def board_over_angle(
     )
 
 
-def _fit_turned_board(
-    psi: ImagingMatrix, board: Board, flat: Array, shadow: Shadow | None
-) -> _TurnedBoard:
+def _fit_turned_board(psi: Psi, board: Board, flat: Array, shadow: Shadow | None) -> _TurnedBoard:
     """Return what a board says of the change of radiance; flat: the terms, (term, view).
 
         reading = sum over views j of  psi_j (level_colour + sum over terms t of  c_t flat_tj)

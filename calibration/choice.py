@@ -12,7 +12,7 @@ from emmc_rig.calibration.boards import Board
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.frames import bands
 from emmc_rig.calibration.shadow import Shadow
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 Array = NDArray[np.floating]
 OPEN = "open aperture"
@@ -55,7 +55,7 @@ def predicted_by_shadow(shadow: Shadow, board: Board) -> Array:
     return read.reshape(board.reading.shape)
 
 
-def predicted_by_psi(psi: ImagingMatrix, board: Board) -> Array:
+def predicted_by_psi(psi: Psi, board: Board) -> Array:
     """Return what a measured Psi predicts of a whiteboard at its shot's position, white lamp."""
     return _sum_over_views(psi.weights, board, psi.binning, lambda plane: plane)
 
@@ -86,7 +86,7 @@ def _sum_by_pixel(view: Array, binning: int) -> Array:
     return view.reshape(shape).sum(axis=(1, 2, 4))
 
 
-def white_by_view(psi: ImagingMatrix, shot: int) -> Iterator[Array]:
+def white_by_view(psi: Psi, shot: int) -> Iterator[Array]:
     """Yield what pixels read of a white board before each view in turn, (pixel_y, pixel_x)."""
     for v, u in np.ndindex(psi.light_field_shape[:2]):
         yield _sum_by_pixel(psi.weights[shot, v, u].astype(np.float64), psi.binning)

@@ -14,7 +14,7 @@ from emmc_rig.calibration.misfit import Misfit
 from emmc_rig.calibration.openings import views_open
 from emmc_rig.calibration.shadow import ANY_COLOUR, Shadow, ShadowMask
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.sensing import Psi, PsiLayout
 
 BAND_PIXELS = 2**14
 """Coefficients computed at once: their derivatives by 41 parameters, and by what each of 25 views
@@ -43,7 +43,7 @@ class Parametric:
         """The shadow as fitted."""
         return Shadow(self.mask if self.defects is None else self.defects.mask, self.fit.placement)
 
-    def psi(self, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
+    def psi(self, layout: PsiLayout, stages: Stages) -> Psi:
         """Return Psi with the mask stage at `stages`, (x, y) in um per shot."""
         return psi_at(self.shadow, layout, stages)
 
@@ -134,7 +134,7 @@ def widening_planes(
     return planes
 
 
-def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> ImagingMatrix:
+def psi_at(shadow: Shadow, layout: PsiLayout, stages: Stages) -> Psi:
     """Return Psi with the mask stage at `stages`, one (x, y) in um per shot."""
     weights = np.empty(layout.weights_shape, dtype=np.float32)
     for (shot, v, u, stored), plane in coefficient_planes(shadow, layout, stages):

@@ -19,7 +19,7 @@ from emmc_rig.calibration.frames import MeanFrame, SensorGain, dark_at
 from emmc_rig.model.camera import camera_of, json_of_shots, pixel_light
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.frames import Exposure, Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 MANY = 1_000_000
 """Frames of a dark whose own noise is not known, and is left out."""
@@ -64,7 +64,7 @@ class Scale:
     the default: all.
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     white_dn_per_s: NDArray[np.floating]
     darks: tuple[MeanFrame, ...]
     gain: SensorGain
@@ -183,7 +183,7 @@ def amplified(dark: MeanFrame, factor: float, black_dn: NDArray[np.floating]) ->
     )
 
 
-def designed_scale(psi: ImagingMatrix, darks: Sequence[MeanFrame] = ()) -> Scale:
+def designed_scale(psi: Psi, darks: Sequence[MeanFrame] = ()) -> Scale:
     """Return the scale of a Psi by the noise model of its camera, which is coarser than a measured.
 
     darks: means of dark frames; by default the camera's black level and read noise. Raises

@@ -30,7 +30,7 @@ from emmc_rig.calibration.boards import (
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.frames import MeanFrame, SensorGain, bands, photon_transfer
 from emmc_rig.model.camera import measured_views
-from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.sensing import Psi, PsiLayout
 
 Array = NDArray[np.floating]
 LARGEST_DARK_SHARE = 0.01
@@ -54,7 +54,7 @@ class Calibration:
     pixels to use at all (None: all).
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     deviation: NDArray[np.float32]
     dark_dn: NDArray[np.float32]
     white_dn_per_s: NDArray[np.float32]
@@ -62,7 +62,7 @@ class Calibration:
     good: NDArray[np.bool_] | None = None
 
     def of_shots(self, shots: Sequence[int], camera_json: str = "") -> Calibration:
-        """Return the calibration of some shots alone; camera_json: see `ImagingMatrix.of_shots`."""
+        """Return the calibration of some shots alone; camera_json: see `Psi.of_shots`."""
         chosen = list(shots)
         return replace(
             self,
@@ -100,7 +100,7 @@ def measure_psi(
     there. on_plane: called after each. Raises CalibrationError for missing frames, frames of
     another size, and a whiteboard too dark to divide by.
     """
-    designed = design.weights if isinstance(design, ImagingMatrix) else None
+    designed = design.weights if isinstance(design, Psi) else None
     gain = _gain(boards, design)
     weights, deviation = (empty(name, design.weights_shape) for name in ("weights", "deviation"))
     for (shot, v, u, stored), values, spread in measured_planes(boards, design, designed):
@@ -195,7 +195,7 @@ def _references(
 def ideal_boards(
     readings: Mapping[tuple[int, int, int, str], Array],
     lamps: tuple[str, ...],
-    design: ImagingMatrix,
+    design: Psi,
     white: Array | None = None,
 ) -> BoardSet:
     """Return the whiteboards of a noise-free sensor from what a simulated bench really reads.

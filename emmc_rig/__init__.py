@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from emmc_rig.formats.scenes import open_scene as scene
     from emmc_rig.model.camera import Camera
     from emmc_rig.model.frames import Frames
-    from emmc_rig.model.sensing import ImagingMatrix as Psi
+    from emmc_rig.model.sensing import Psi as Psi
     from emmc_rig.process.calibrating import calibrate
     from emmc_rig.process.filming import reconstruct_film
     from emmc_rig.process.raw_frames import frames
@@ -55,7 +55,7 @@ _HOME = {
     "Camera": "emmc_rig.model.camera:Camera",
     "ERRORS": "emmc_rig.errors:ERRORS",
     "Frames": "emmc_rig.model.frames:Frames",
-    "Psi": "emmc_rig.model.sensing:ImagingMatrix",
+    "Psi": "emmc_rig.model.sensing:Psi",
     "Result": "emmc_rig.process.result:Result",
     "Scene": "emmc_rig.formats.scenes:Scene",
     "Session": "emmc_rig.session.session:Session",

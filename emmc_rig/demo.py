@@ -24,7 +24,7 @@ from emmc_rig.formats.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.process.result import Result
 from emmc_rig.progress import Event, Watcher
 from emmc_rig.reconstruction.dictionary import open_dictionary
@@ -157,7 +157,7 @@ def run_demo(settings: DemoSettings, folder: Path, watcher: Watcher | None = Non
         measured = _measured(session, rig, bench, design)
     calibration, taken = measured.calibration, measured.taken
 
-    def light_field(psi: ImagingMatrix) -> tuple[Reconstruction, Verdict]:
+    def light_field(psi: Psi) -> tuple[Reconstruction, Verdict]:
         return reconstruct_judged(
             settings.method, psi, taken, dictionary, settings.solver,
             lambda p: watcher.step(_progress_words(p)),
@@ -216,14 +216,14 @@ class _Measured(NamedTuple):
     """
 
     calibration: Calibration
-    exact_psi: ImagingMatrix
+    exact_psi: Psi
     taken: Frames
     frames_dn: NDArray[np.integer]
     exposures_s: Array
     pictures: list[tuple[str, Array]]
 
 
-def _measured(session: Session, rig: Rig, bench: Bench, design: ImagingMatrix) -> _Measured:
+def _measured(session: Session, rig: Rig, bench: Bench, design: Psi) -> _Measured:
     """Return Psi and the readings of the shots of a complete session."""
     boards = whiteboards(session)
     calibration = measure_psi(boards, design)

@@ -174,7 +174,9 @@ class SensedDictionary:
     def penalty(self, data: Array32) -> float:
         """Return eta of a patch."""
         size = float(np.linalg.norm(data))
-        return float(_penalty(self.settings, self.noise_sigma, len(self.atoms), self.typical_norm, size))
+        return float(
+            _penalty(self.settings, self.noise_sigma, len(self.atoms), self.typical_norm, size)
+        )
 
     @cached_property
     def rho(self) -> float:
@@ -331,9 +333,7 @@ def _coded_together(
     return found
 
 
-def _hidden(
-    inverse: Array32, usable: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], Array32]:
+def _hidden(inverse: Array32, usable: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Array32]:
     """Return for each patch the readings H that are not usable, and G_H G_HH^-1.
 
     inverse: G, (measurement, measurement). Results: (patch, h) and (patch, measurement, h); those

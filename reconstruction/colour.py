@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import OPPONENT
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 Array = NDArray[np.floating]
 NEAREST_PX = 0.7
@@ -41,9 +41,7 @@ class Chroma:
     variance: NDArray[np.float64]
 
 
-def chroma_of(
-    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], picture: Array
-) -> Chroma:
+def chroma_of(psi: Psi, frames: Array, usable: NDArray[np.bool_], picture: Array) -> Chroma:
     """Return the chrominance that frames (shot, pixel_y, pixel_x) show.
 
     With e the reading of the grey picture and q_i that of chrominance i over e, the readings vary
@@ -103,7 +101,7 @@ def _regressed(
     return change, np.asarray(covariance, dtype=np.float64)
 
 
-def coloured(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], picture: Array) -> Array:
+def coloured(psi: Psi, frames: Array, usable: NDArray[np.bool_], picture: Array) -> Array:
     """Return the smooth picture (y, x, c) with the colours that the frames show, none below 0."""
     chroma = _of_samples(chroma_of(psi, frames, usable, picture).value, psi.binning)
     grey = picture.mean(axis=-1, keepdims=True)
@@ -111,7 +109,7 @@ def coloured(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], pictu
 
 
 def unseen_colour(
-    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], picture: Array
+    psi: Psi, frames: Array, usable: NDArray[np.bool_], picture: Array
 ) -> NDArray[np.float64]:
     """Return the variance of a light field's values by colours that frames do not show, (y, x).
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.errors import ReconstructionError
 
 Array = NDArray[np.floating]
@@ -52,7 +52,7 @@ def _unlike(given: tuple[int, ...], needed: tuple[int, int, int]) -> str:
     return "frames of another sensor or part of it: use the Psi measured with it"
 
 
-def checked_inputs(psi: ImagingMatrix, frames: Frames) -> Frames:
+def checked_inputs(psi: Psi, frames: Frames) -> Frames:
     """Return frames with readings of Psi's type, 0 at unusable pixels.
 
     Raises ReconstructionError for frames that do not fit Psi or are not finite where usable, that
@@ -89,14 +89,14 @@ class Readings:
     root mean square. noise: variance of each reading, float32, the mean where it is not usable.
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     frames: Array
     typical: float
     noise: Array
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, psi: ImagingMatrix, frames: Frames) -> Readings:
+    def of(cls, psi: Psi, frames: Frames) -> Readings:
         """Return the readings of frames; raises ReconstructionError as `checked_inputs` does."""
         frames = checked_inputs(psi, frames)
         typical = frames.noise_sigma

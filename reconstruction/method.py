@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import Settings
 from emmc_rig.reconstruction.adaptive.film import Film, FilmSettings
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
@@ -68,7 +68,7 @@ class Given:
     shots; then the light field is that at the time of the first one.
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     frames: Frames
     dictionary: Dictionary | None
     on_step: Callable[[Progress], None] | None
@@ -103,7 +103,7 @@ class Sensitivity:
     one_shot: bool = False
 
 
-def _no_patches(psi: ImagingMatrix, settings: ShippedSettings) -> None:
+def _no_patches(psi: Psi, settings: ShippedSettings) -> None:
     return None
 
 
@@ -136,7 +136,7 @@ class Method:
     package: str | None = None
     factor: float | None = None
     scout: str | None = None
-    patches: Callable[[ImagingMatrix, ShippedSettings], SparseSettings | None] = _no_patches
+    patches: Callable[[Psi, ShippedSettings], SparseSettings | None] = _no_patches
 
     @property
     def installed(self) -> bool:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.compiling import njit
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.errors import ReconstructionError
 
 LANES = 16
@@ -92,7 +92,7 @@ def _by_pixel(
 
 
 def sense_patches(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     corners: NDArray[np.int64],
     shape: tuple[int, int],

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames, even_frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.problem import choose_mu
 from emmc_rig.reconstruction.tv import Sweeps
@@ -28,7 +28,7 @@ PICTURE_NOISE, COARSE_NOISE = 0.1, 0.06
 Tried on three built-in scenes and three cameras at 192x256: half and double cost 0 to 1.5 dB."""
 
 
-def coarser(psi: ImagingMatrix, factor: int) -> ImagingMatrix:
+def coarser(psi: Psi, factor: int) -> Psi:
     """Return Psi of light fields that are constant over blocks of factor x factor samples.
 
     factor: a multiple of the binning. What is left of the picture beyond whole blocks is cut off.
@@ -47,7 +47,7 @@ def coarser(psi: ImagingMatrix, factor: int) -> ImagingMatrix:
     colour = None
     if psi.colour is not None:
         colour = _grouped(psi.colour[:, ::k, ::k], part, high, wide)
-    return ImagingMatrix(
+    return Psi(
         np.ascontiguousarray(weights.reshape(-1, views_v, views_u, high, stored, wide)), colour
     )
 
@@ -61,7 +61,7 @@ def _grouped(frames: NDArray, part: int, high: int, wide: int) -> NDArray:
 class _Following:
     """Total variation of frame after frame by one Psi."""
 
-    def __init__(self, psi: ImagingMatrix, frames: Frames) -> None:
+    def __init__(self, psi: Psi, frames: Frames) -> None:
         self._data, self._usable = checked_inputs(psi, frames).readings, frames.usable
         mu = choose_mu(psi, self._data[self._usable], frames.noise_sigma)
         self.sweeps = Sweeps.usual(psi, self._data, self._usable, mu)
@@ -80,7 +80,7 @@ class Preview:
     Preview.
     """
 
-    def __init__(self, psi: ImagingMatrix, factor: int, frames: Frames) -> None:
+    def __init__(self, psi: Psi, factor: int, frames: Frames) -> None:
         readings, good = frames.readings, frames.usable
         coarse = coarser(psi, factor)
         self.size = coarse.size

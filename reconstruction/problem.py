@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.lightfield import OPPONENT
-from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
+from emmc_rig.model.sensing import Psi, rows_of_colours
 from emmc_rig.reconstruction.colour import coloured
 from emmc_rig.reconstruction.differences import norm_squared, planar_variation
 
@@ -61,7 +61,7 @@ class Problem:
     (3, 3) of Psi's type, by which colours are multiplied before differences are taken.
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     frames: Array
     usable: NDArray[np.bool_]
     mu: float
@@ -91,7 +91,7 @@ class Problem:
         return self.rho * self.patch_term.weight[::k, ::k].astype(np.float64)
 
 
-def choose_mu(psi: ImagingMatrix, frames: Array, noise_sigma: float, order: int = 1) -> float:
+def choose_mu(psi: Psi, frames: Array, noise_sigma: float, order: int = 1) -> float:
     """Return mu for frames (of usable pixels), see `relative_mu`.
 
     That was fitted where masks pass half the light. Psi, frames and noise c times as small are the
@@ -137,7 +137,7 @@ def contrast(guess: Array) -> float:
     return max(float(guess.std()), 0.05 * float(np.abs(guess).max()), 1e-12)
 
 
-def smooth_guess(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def smooth_guess(psi: Psi, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return a blurred picture (y, x, c) that explains the frames' local means, float32.
 
     Every colour is the ratio of blurred back-projections, as if all views were equal; without
@@ -155,7 +155,7 @@ def smooth_guess(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -
     return picture if psi.colour is not None else coloured(psi, readings, usable, picture)
 
 
-def first_light_field(psi: ImagingMatrix, guess: Array, patch_term: PatchTerm | None) -> Array:
+def first_light_field(psi: Psi, guess: Array, patch_term: PatchTerm | None) -> Array:
     """Return a light field to begin with: the patches where there are any, else the guess."""
     everywhere = np.broadcast_to(guess, psi.light_field_shape)
     if patch_term is None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.bands import row_kernel
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.problem import smooth_guess
 
 Array = NDArray[np.floating]
@@ -88,7 +88,7 @@ class Screened:
     lines: NDArray[np.bool_]
 
 
-def screened(psi: ImagingMatrix, given: Frames) -> Screened:
+def screened(psi: Psi, given: Frames) -> Screened:
     """Return frames after screening; frames without faults come back unchanged.
 
     given: finite where usable.
@@ -133,7 +133,7 @@ def screened(psi: ImagingMatrix, given: Frames) -> Screened:
     return Screened(kept, tuple(notes), dark, double, gains, bad, lines)
 
 
-def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+def dark_shots(psi: Psi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that no light of the scene reached, while it reached others."""
     of_white = psi.picture_weights.sum(axis=-1).mean(axis=(1, 2)) * psi.binning**2
     read = [
@@ -147,7 +147,7 @@ def dark_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     return tuple(int(shot) for shot in np.flatnonzero(dark))
 
 
-def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
+def double_shots(psi: Psi, frames: Array, usable: NDArray[np.bool_]) -> tuple[int, ...]:
     """Return the shots that repeat another although they differ in Psi.
 
     With p the difference of two shots that Psi predicts and r that of their readings, they are the
@@ -171,7 +171,7 @@ def double_shots(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -
     return tuple(sorted(doubles))
 
 
-def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def shot_gains(psi: Psi, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return the brightness of the light in every shot, 1 where none is sure.
 
     Shots are compared if they see the same colours: behind a red and a blue filter the scene, too,
@@ -193,7 +193,7 @@ def shot_gains(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> 
     return gains
 
 
-def _gains_of(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def _gains_of(psi: Psi, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return the brightness of the light in the shots that are usable, of the same colours."""
     even = np.ones(len(frames))
     kept = np.flatnonzero(usable.any(axis=(1, 2)))
@@ -225,7 +225,7 @@ def _gains_of(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> A
 
 
 def dead_lines(
-    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]
+    psi: Psi, frames: Array, usable: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the rows and the columns (both one-dimensional) that are dead or stuck in all shots.
 
@@ -332,7 +332,7 @@ def neighbour_range(begin, end, values, colours, good, radius, tail, fewest, low
                 low[y, x], high[y, x] = least[step, x], most[step, x]
 
 
-def bad_pixels(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def bad_pixels(psi: Psi, frames: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the bad pixels, (pixel_y, pixel_x), whose readings are unlike those of all neighbours.
 
     The ratio of a reading to the prediction of a smooth picture is compared with the range of that
@@ -394,7 +394,7 @@ def _bright_details(
     return (count > 1) & (factor > 0) & (as_light < AS_LIGHT * as_offset)
 
 
-def _predicted(psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_]) -> Array:
+def _predicted(psi: Psi, frames: Array, usable: NDArray[np.bool_]) -> Array:
     """Return what a smooth picture, the same in all views, reads."""
     return psi.forward_picture(smooth_guess(psi, frames, usable))
 

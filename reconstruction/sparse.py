@@ -26,7 +26,7 @@ from pydantic import Field
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import Settings
 from emmc_rig.reconstruction import bpdn
 from emmc_rig.reconstruction.dictionary import Dictionary
@@ -146,7 +146,7 @@ class _Coder:
 
     def __init__(
         self,
-        psi: ImagingMatrix,
+        psi: Psi,
         frames: Frames,
         dictionary: Dictionary,
         settings: SparseSettings,
@@ -246,7 +246,7 @@ class _Coder:
 
 @one_blas_thread()
 def estimate_patches(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     dictionary: Dictionary,
     settings: SparseSettings,
@@ -301,7 +301,7 @@ def _in_order(
 
 
 def reconstruct_sparse(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     dictionary: Dictionary,
     settings: SparseSettings | None = None,

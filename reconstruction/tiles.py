@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames, even_frames
-from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.sensing import Psi, PsiLayout
 from emmc_rig.reconstruction.adaptive.settings import SIDES, Side
 from emmc_rig.reconstruction.adaptive.survey import contrast_of
 from emmc_rig.reconstruction.dictionary import Dictionary
@@ -284,9 +284,9 @@ class _Sample:
     psi, frames: of all windows, along x. windows: Psi of each.
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     frames: Frames
-    windows: list[ImagingMatrix]
+    windows: list[Psi]
 
     @classmethod
     def of(cls, psi: PsiLayout, frames: Frames, multiple: int) -> _Sample:
@@ -365,7 +365,7 @@ def surveyed(
 
 
 def _settled(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     settings: MethodSettings,
     sparse: SparseSettings | None,
@@ -404,7 +404,7 @@ class SolvedBlock:
 
 def solve_block(
     name: str,
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     block: Block,
     settings: MethodSettings,

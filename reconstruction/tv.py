@@ -38,7 +38,7 @@ from pydantic import Field
 
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix, rows_of_colours
+from emmc_rig.model.sensing import Psi, rows_of_colours
 from emmc_rig.model.settings import Settings
 from emmc_rig.reconstruction import differences, kernels
 from emmc_rig.reconstruction.inputs import checked_inputs
@@ -119,9 +119,7 @@ class Sweeps:
         self._sweep = partial(kernels.sweep, fit, steps, taps, self.planar, dual, room, self._moved)
 
     @classmethod
-    def usual(
-        cls, psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], mu: float
-    ) -> Sweeps:
+    def usual(cls, psi: Psi, frames: Array, usable: NDArray[np.bool_], mu: float) -> Sweeps:
         """Return steps of total variation with the usual settings, begun with a smooth picture.
 
         frames, usable: (shot, pixel_y, pixel_x), checked, the frames in Psi's type and finite. mu:
@@ -150,7 +148,7 @@ class Sweeps:
 
 
 def few_steps(
-    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], mu: float, count: int
+    psi: Psi, frames: Array, usable: NDArray[np.bool_], mu: float, count: int
 ) -> NDArray[np.float32]:
     """Return the light field (v, u, y, x, c) of `count` steps of total variation.
 
@@ -162,7 +160,7 @@ def few_steps(
 
 
 def reconstruct_tv(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     settings: TVSettings | None = None,
     on_step: Callable[[Progress], None] | None = None,

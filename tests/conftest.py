@@ -18,7 +18,7 @@ import pytest
 from programs import exit_code
 
 from emmc_rig.model.camera import Camera, build_imaging_matrix
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 # A script's background job ignores Ctrl-C, and so would every program that a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -185,7 +185,7 @@ def random_psi():
             colour = rng.integers(0, 3, (shots, *size), dtype=np.uint8)
             if binning > 1:
                 colour = colour[:, ::binning, ::binning].repeat(binning, 1).repeat(binning, 2)
-        return ImagingMatrix(weights, colour, binning)
+        return Psi(weights, colour, binning)
 
     return make
 
@@ -206,6 +206,6 @@ def coded_psi():
             }
         )
         psi = build_imaging_matrix(camera.with_shots(shots), size)
-        return ImagingMatrix(psi.weights.astype(dtype), psi.colour, binning, psi.camera_json)
+        return Psi(psi.weights.astype(dtype), psi.colour, binning, psi.camera_json)
 
     return made

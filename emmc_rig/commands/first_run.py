@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from emmc_rig.commands.output import say
 from emmc_rig.model.compiling import is_kept
 from emmc_rig.model.frames import even_frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction import kernels
 from emmc_rig.reconstruction.result import Progress
 
@@ -119,7 +119,7 @@ def compile_for(part: str, camera: str, shots: int | None) -> None:
         emmc.reconstruct(psi, frames, part)
 
 
-def _search(psi: ImagingMatrix, frames: NDArray[np.floating]) -> None:
+def _search(psi: Psi, frames: NDArray[np.floating]) -> None:
     """Reconstruct as far as the first fit: search disparities, and start by total variation."""
     from emmc_rig.reconstruction.adaptive.method import reconstruct_adaptive
 
@@ -135,7 +135,7 @@ def _search(psi: ImagingMatrix, frames: NDArray[np.floating]) -> None:
 
 
 def _fit(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: NDArray[np.floating],
     disparity: NDArray[np.floating],
     picture: NDArray[np.floating],

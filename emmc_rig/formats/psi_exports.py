@@ -18,7 +18,7 @@ from scipy import sparse
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 LARGEST_MAT_BYTES = 2**31
 """Of a variable in a MAT file of version 5, the only one that SciPy writes."""
@@ -27,7 +27,7 @@ IN_MATLAB = "; of light_field(v, u, y, x, colour) x = reshape(permute(light_fiel
 """Columns first, as MATLAB has them."""
 
 
-def write_npz(folder: Path, psi: ImagingMatrix, frames: Frames | None) -> None:
+def write_npz(folder: Path, psi: Psi, frames: Frames | None) -> None:
     """Write psi.npz as `scipy.sparse.load_npz` reads it, layout.json, and frames.npz."""
     sparse.save_npz(folder / "psi.npz", psi.to_scipy())
     (folder / "layout.json").write_text(json.dumps(_layout(psi), indent=1) + "\n")
@@ -35,7 +35,7 @@ def write_npz(folder: Path, psi: ImagingMatrix, frames: Frames | None) -> None:
         np.savez_compressed(folder / "frames.npz", **_arrays(frames))
 
 
-def write_mat(folder: Path, psi: ImagingMatrix, frames: Frames | None) -> None:
+def write_mat(folder: Path, psi: Psi, frames: Frames | None) -> None:
     """Write psi.mat: Psi, its layout, and columns of readings, deviation and usable.
 
     Raises AppError for a Psi that MAT files do not hold.
@@ -69,7 +69,7 @@ def _arrays(frames: Frames) -> dict[str, Any]:
     }
 
 
-def _layout(psi: ImagingMatrix) -> dict[str, Any]:
+def _layout(psi: Psi) -> dict[str, Any]:
     return {
         "order": ORDER,
         "frames_shape": psi.frames_shape,
@@ -79,7 +79,7 @@ def _layout(psi: ImagingMatrix) -> dict[str, Any]:
     }
 
 
-PSI_FORMATS: dict[str, Callable[[Path, ImagingMatrix, Frames | None], None]] = {
+PSI_FORMATS: dict[str, Callable[[Path, Psi, Frames | None], None]] = {
     "npz": write_npz,
     "mat": write_mat,
 }

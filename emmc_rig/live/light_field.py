@@ -32,7 +32,7 @@ from emmc_rig.formats.format import Export
 from emmc_rig.live.served_page import Picture, Pictured, Query
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames, even_frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.reconstruction.adaptive.film import Film
 from emmc_rig.reconstruction.errors import ReconstructionError
@@ -120,7 +120,7 @@ class LiveLightField:
         self._periods: deque[tuple[float, float]] = deque(maxlen=RECENT)
 
     @property
-    def psi(self) -> ImagingMatrix:
+    def psi(self) -> Psi:
         """Of all shots."""
         return self._scale.psi
 
@@ -304,7 +304,7 @@ class _Refinement:
     time of the begin, and the number of the newest frame then.
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     frames: Frames
     method: str
     solve: Solve

@@ -33,7 +33,7 @@ from emmc_rig.model.masks import AnyPattern, cfa_tile
 from emmc_rig.model.noise import SensorNoise
 from emmc_rig.model.pupil import LEAST_SHARE, Openings, Pupil, cell_openings, field_knots
 from emmc_rig.model.reading import read_yaml
-from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.sensing import Psi, PsiLayout
 from emmc_rig.model.settings import Settings, validated
 from emmc_rig.model.view_axes import ANGLES, ATTRIBUTE, ViewAxis, grid_name, view_names
 
@@ -262,7 +262,7 @@ class Camera(Settings):
 
         return self.model_copy(update={"shots": tuple(moved(index) for index in range(count))})
 
-    def psi(self, size: tuple[int, int]) -> ImagingMatrix:
+    def psi(self, size: tuple[int, int]) -> Psi:
         """Return the imaging matrix for light fields of `size` (rows, columns) samples.
 
         Raises CameraError, see `build_imaging_matrix`, and ArgumentError for what is no size.
@@ -274,7 +274,7 @@ class Camera(Settings):
         self,
         scene: ArrayLike,
         seed: int | np.random.Generator = 0,
-        psi: ImagingMatrix | None = None,
+        psi: Psi | None = None,
         exposure_s: ArrayLike | None = None,
     ) -> SimulatedFrames:
         """Return the frames of a light field (v, u, y, x, c), with the sensor's noise (eq. 14).
@@ -292,7 +292,7 @@ class Camera(Settings):
             seed, (int, np.random.Generator), "seed", "a whole number, or a generator of NumPy"
         )
         if psi is not None:
-            required(psi, ImagingMatrix, "psi", "the camera's Psi, camera.psi(size)")
+            required(psi, Psi, "psi", "the camera's Psi, camera.psi(size)")
         psi = self.psi((light_field.shape[2], light_field.shape[3])) if psi is None else psi
         camera = self if exposure_s is None else self.with_exposures(exposure_s)
         return camera.read_out(psi.forward(light_field), seed)
@@ -420,14 +420,14 @@ def measured_views(psi: PsiLayout) -> NDArray[np.bool_]:
         described = camera_of(psi)
         if described.views == psi.views:
             measured &= described.views_measured()
-    if isinstance(psi, ImagingMatrix):
+    if isinstance(psi, Psi):
         for v, u in np.argwhere(measured):
             measured[v, u] = psi.weights[:, v, u].any()
     return measured
 
 
 def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
-    """Return the camera with some of its shots alone, as `ImagingMatrix.camera_json`.
+    """Return the camera with some of its shots alone, as `Psi.camera_json`.
 
     "" for cameras whose mask shows another pattern in every shot: no subset is a camera.
     """
@@ -439,7 +439,7 @@ def json_of_shots(camera: Camera, shots: Sequence[int]) -> str:
     return camera.model_copy(update={"shots": tuple(chosen)}).model_dump_json()
 
 
-def psi_of_shot(psi: ImagingMatrix, shot: int) -> ImagingMatrix:
+def psi_of_shot(psi: Psi, shot: int) -> Psi:
     """Return the Psi of one shot, counted from 0, with its camera."""
     if psi.shots == 1:
         return psi
@@ -873,7 +873,7 @@ def open_shares(camera: Camera, size: tuple[int, int]) -> list[NDArray[np.float3
 
 def build_imaging_matrix(
     camera: Camera, size: tuple[int, int], plates: dict[str, Plate] | None = None
-) -> ImagingMatrix:
+) -> Psi:
     """Return Psi of a camera for a light field of `size` (rows, columns) samples (paper, eq. 6, 7).
 
         Psi[s, v, u, y, c, x] = t[s, v, u, y, x, c]  r[s, y, x, c] / (sum_c r  V U k^2)

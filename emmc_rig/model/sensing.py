@@ -89,7 +89,7 @@ class PsiLayout:
     """Sizes, colours and camera of a Psi: all that Psi in memory and in files have in common.
 
     Alone it stands for a Psi without coefficients, of sensors whose Psi does not fit into memory.
-    weights_shape: (shot, v, u, y, stored colour, x). Others: see `ImagingMatrix`.
+    weights_shape: (shot, v, u, y, stored colour, x). Others: see `Psi`.
     """
 
     def __init__(
@@ -108,11 +108,11 @@ class PsiLayout:
         """Shape of the weights."""
         return self._weights_shape
 
-    def psi(self, weights: Array) -> ImagingMatrix:
+    def psi(self, weights: Array) -> Psi:
         """Return the Psi that this is the layout of."""
-        return ImagingMatrix(weights, self.colour, self.binning, self.camera_json, self.view_axes)
+        return Psi(weights, self.colour, self.binning, self.camera_json, self.view_axes)
 
-    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
+    def window(self, rows: slice, columns: slice) -> Psi:
         """Return Psi of some rows and columns of samples, whole pixels."""
         raise SensingError("this Psi has no coefficients")
 
@@ -153,7 +153,7 @@ class Psi(PsiLayout):
     natural shapes; `scipy.sparse.linalg.aslinearoperator(psi)` takes them flattened.
 
     >>> weights = np.full((1, 1, 1, 4, 3, 6), 1 / 3, dtype=np.float32)
-    >>> psi = ImagingMatrix(weights, colour=None)
+    >>> psi = Psi(weights, colour=None)
     >>> psi
     Psi(1 shot, 1x1 views, 4x6, three colours a pixel, 0.00029 MB)
     >>> frames = psi @ np.ones((1, 1, 4, 6, 3), dtype=np.float32)
@@ -232,7 +232,7 @@ class Psi(PsiLayout):
             raise SensingError(f"{what} of shape {array.shape} given, Psi needs {shape}")
         return np.asarray(array, dtype=self.weights.dtype)
 
-    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
+    def window(self, rows: slice, columns: slice) -> Psi:
         """Return Psi of some rows and columns of samples, contiguous in memory.
 
         Raises SensingError when the slices cut a pixel.
@@ -249,7 +249,7 @@ class Psi(PsiLayout):
             colour = np.ascontiguousarray(colour[:, rows, columns])
         return replace(self, weights=weights, colour=colour)
 
-    def of_shots(self, shots: Sequence[int], camera_json: str = "") -> ImagingMatrix:
+    def of_shots(self, shots: Sequence[int], camera_json: str = "") -> Psi:
         """Return Psi of some shots, in the order given; camera_json: of a camera with these."""
         chosen = list(shots)
         colour = None if self.colour is None else self.colour[chosen]
@@ -320,10 +320,10 @@ class Psi(PsiLayout):
             )
         return inverse
 
-    def of_one_view(self) -> ImagingMatrix:
+    def of_one_view(self) -> Psi:
         """Return Psi of light fields of one view, which stands for all."""
         summed = self.weights.sum(axis=(1, 2), keepdims=True, dtype=np.float64)
-        return ImagingMatrix(summed.astype(self.weights.dtype), self.colour, self.binning)
+        return Psi(summed.astype(self.weights.dtype), self.colour, self.binning)
 
     @cached_property
     def picture_weights(self) -> Array:
@@ -390,7 +390,7 @@ class Psi(PsiLayout):
         cfa: str | tuple[str, ...] = "mono",
         binning: int = 1,
         view_axes: ViewAxes = ANGLES,
-    ) -> ImagingMatrix:
+    ) -> Psi:
         """Return Psi from an explicit sparse matrix, such as another program's.
 
         Args:
@@ -409,7 +409,7 @@ class Psi(PsiLayout):
             ArgumentError: an argument of another type.
 
         >>> from scipy import sparse
-        >>> psi = ImagingMatrix.from_scipy(sparse.eye_array(6), views=(1, 1), size=(2, 3))
+        >>> psi = Psi.from_scipy(sparse.eye_array(6), views=(1, 1), size=(2, 3))
         >>> psi, psi.to_scipy().nnz
         (Psi(1 shot, 1x1 views, 2x3, three colours a pixel, 7.2e-05 MB), 18)
         """
@@ -456,7 +456,7 @@ class Psi(PsiLayout):
         cfa: str | tuple[str, ...] | None = None,
         binning: int = 1,
         view_axes: ViewAxes = ANGLES,
-    ) -> ImagingMatrix:
+    ) -> Psi:
         """Return Psi from what every pixel sees of every view, such as a mask's transmittances.
 
         A reading is the sum over the views of weight times light, so that weights that sum to 1 at
@@ -481,7 +481,7 @@ class Psi(PsiLayout):
 
         >>> opened = np.zeros((2, 1, 2, 4, 6))  # two shots, each through one of two openings
         >>> opened[0, 0, 0] = opened[1, 0, 1] = 1
-        >>> psi = ImagingMatrix.from_weights(opened)
+        >>> psi = Psi.from_weights(opened)
         >>> psi, round(psi.light_efficiency(), 6)
         (Psi(2 shots, 1x2 views, 4x6, one colour a pixel, 0.00038 MB), 1.0)
         """
@@ -510,7 +510,7 @@ class Psi(PsiLayout):
         stored = np.ascontiguousarray(rows_of_colours(given))
         return cls(stored, None, binning, view_axes=view_axes)._compact()
 
-    def _compact(self) -> ImagingMatrix:
+    def _compact(self) -> Psi:
         """Return Psi with one stored colour where every sample's pixel sees one at most."""
         seen = self.weights.any(axis=(1, 2))  # (shot, y, colour, x)
         if seen.sum(axis=2).max() > 1:
@@ -529,7 +529,7 @@ class Psi(PsiLayout):
         if self.colour is not None and (self.colour == self.colour.flat[0]).all():
             light_field[...] = light_field[..., self.colour.flat[0], None]
 
-    def relative_difference(self, reference: ImagingMatrix) -> float:
+    def relative_difference(self, reference: Psi) -> float:
         """Return |Psi - reference| / |reference| in the Frobenius norm."""
         if self.weights.shape != reference.weights.shape:
             raise SensingError("only Psi of the same camera and size compare")
@@ -563,7 +563,7 @@ class Psi(PsiLayout):
             file["colour"] = self.colour
 
     @classmethod
-    def load(cls, path: str | Path) -> ImagingMatrix:
+    def load(cls, path: str | Path) -> Psi:
         """Read a saved Psi; raises SensingError when it is not one, or damaged."""
         path = path_of(path, "path", "the file of a Psi")
         with stored_arrays(path, SensingError, "measure Psi again") as stored:
@@ -582,14 +582,11 @@ class Psi(PsiLayout):
         return matrix
 
 
-ImagingMatrix = Psi  # its name inside of this program
-
-
 @dataclass(frozen=True, eq=False)
 class TransposedPsi:
     """A view of Psi as Psi^T: `psi.T @ frames` is a light field (v, u, y, x, c)."""
 
-    T: ImagingMatrix
+    T: Psi
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.arguments import numbers_of, refusal, required
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera, Offset, Positive
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import Settings, validated
 from emmc_rig.process.session_calibration import (
     SessionCalibration,
@@ -77,7 +77,7 @@ def calibrate(
     camera: Camera,
     *,
     darks: ArrayLike | Mapping[float, ArrayLike],
-) -> tuple[ImagingMatrix, SessionCalibration]: ...
+) -> tuple[Psi, SessionCalibration]: ...
 
 
 def calibrate(
@@ -89,7 +89,7 @@ def calibrate(
     darks: ArrayLike | Mapping[float, ArrayLike] | None = None,
     sensor: bool = False,
     watcher: Watcher | None = None,
-) -> SessionCalibration | tuple[ImagingMatrix, SessionCalibration]:
+) -> SessionCalibration | tuple[Psi, SessionCalibration]:
     """Return Psi as whiteboards measure it: `calibrate(session)`, or arrays with their poses.
 
     Arrays are calibrated by the methods of a session, and judged by those for validation. Of what a
@@ -133,7 +133,7 @@ def calibrate(
 @one_blas_thread()
 def _of_arrays(
     whiteboards: Any, poses: Any, camera: Camera, darks: Any
-) -> tuple[ImagingMatrix, SessionCalibration]:
+) -> tuple[Psi, SessionCalibration]:
     """Return Psi of arrays, and its calibration; see `calibrate`."""
     started = time.perf_counter()
     required(whiteboards, (list, tuple, np.ndarray), "whiteboards", "a list of arrays, DN")

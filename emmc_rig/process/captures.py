@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import is_session
 from emmc_rig.store.psi import StoredPsi, psi_beside, read_frames
@@ -45,7 +45,7 @@ class Capture:
         """
         return read_frames(self.folder), psi or self.psi_file()
 
-    def loaded(self, psi: Path | None, place: int | None) -> tuple[ImagingMatrix, Frames]:
+    def loaded(self, psi: Path | None, place: int | None) -> tuple[Psi, Frames]:
         """Return Psi and readings; see `frames`."""
         return StoredPsi(psi or self.psi_file()).load(), read_frames(self.folder)
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from emmc_rig.errors import WrongUsageError
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
 from emmc_rig.reconstruction.tiles import SAMPLE, SAMPLES, TEXTURE_REACH, Grid
 from emmc_rig.store.psi import StoredPsi
@@ -49,7 +49,7 @@ PARALLAX_PX = 3.0
 """Disparity whose halo is reckoned with before a survey has found the capture's own."""
 
 
-def method_within(psi: ImagingMatrix, frames: Frames, budget: str) -> tuple[str, str]:
+def method_within(psi: Psi, frames: Frames, budget: str) -> tuple[str, str]:
     """Return the method for a budget as typed, such as "30s", and why it is, in words.
 
     Raises WrongUsageError for what is no time, ReconstructionError for frames that do not fit Psi.
@@ -65,7 +65,7 @@ def method_within(psi: ImagingMatrix, frames: Frames, budget: str) -> tuple[str,
     return method, f"{method}: {why} {budget_s:g} s; about {takes_s:.2g} s on this machine"
 
 
-def timed(psi: ImagingMatrix, frames: Frames) -> float:
+def timed(psi: Psi, frames: Frames) -> float:
     """Return the seconds that TIMED takes for all of the frames, from its time for a window."""
     k, places = psi.binning, []
     for length in psi.size:

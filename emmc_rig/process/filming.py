@@ -36,7 +36,7 @@ from emmc_rig.model.camera import psi_of_shot
 from emmc_rig.model.files import PART, whole_file, whole_folder
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.model.sensing import ImagingMatrix, SensingError
+from emmc_rig.model.sensing import Psi, SensingError
 from emmc_rig.process.cost import (
     BASE_BYTES,
     assumed_grid,
@@ -111,7 +111,7 @@ class Latest:
 
     def next(
         self,
-        psi: ImagingMatrix,
+        psi: Psi,
         shot: int,
         frames: Frames,
         method: str,
@@ -127,7 +127,7 @@ class Latest:
         result = Result(replace(solved, film=None), verdict, of_shot, frames, settings=settings)
         return result, replace(self, film=solved.film, shots=shots)
 
-    def saved(self, path: Path, psi: ImagingMatrix) -> Latest:
+    def saved(self, path: Path, psi: Psi) -> Latest:
         """Write it, whole and on the disk; return it as `opened` would."""
         arrays = self.film.arrays()
         _save(path, {"shots": self.shots, "place": self.place, "failed": self.failed}, arrays)
@@ -135,7 +135,7 @@ class Latest:
         return replace(self, film=Film.restored(arrays, [psi_of_shot(psi, s) for s in self.shots]))
 
     @classmethod
-    def opened(cls, path: Path, psi: ImagingMatrix) -> Latest:
+    def opened(cls, path: Path, psi: Psi) -> Latest:
         """Return what was written there; raises one of DAMAGED."""
         about, arrays = _open(path)
         film = Film.restored(arrays, [psi_of_shot(psi, shot) for shot in about["shots"]])
@@ -158,7 +158,7 @@ def _open(path: Path) -> tuple[dict[str, Any], dict[str, NDArray]]:
 
 
 def reconstruct_film(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: ArrayLike | Iterable[Frames],
     method: str = DEFAULT_METHOD,
     *,
@@ -190,7 +190,7 @@ def reconstruct_film(
     >>> [result.light_field.shape for result in emmc.reconstruct_film(psi, film, "adaptive-fast")]
     [(5, 5, 24, 32, 3), (5, 5, 24, 32, 3)]
     """
-    required(psi, ImagingMatrix, "psi", PSI_TAKES)
+    required(psi, Psi, "psi", PSI_TAKES)
     _refuse_without_films(method)
     chosen = settings_of(settings)
     if isinstance(frames, Frames) or not isinstance(frames, Iterable):

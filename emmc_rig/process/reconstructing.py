@@ -22,7 +22,7 @@ from emmc_rig.model.arguments import NAMES, numbers_of, path_of, refusal, requir
 from emmc_rig.model.camera import camera_of, pixel_light
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.reading import read_yaml
-from emmc_rig.model.sensing import ImagingMatrix, PsiLayout
+from emmc_rig.model.sensing import Psi, PsiLayout
 from emmc_rig.model.settings import validated
 from emmc_rig.model.view_axes import ATTRIBUTE, stored_as
 from emmc_rig.process.block_tasks import Blocks, block_job, compute_blocks
@@ -68,7 +68,7 @@ Place = tuple[Capture, Path]
 
 
 def reconstruct(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames | ArrayLike,
     method: str = DEFAULT_METHOD,
     *,
@@ -104,7 +104,7 @@ def reconstruct(
     >>> emmc.reconstruct(psi, psi @ scene, "tv").light_field.shape
     (5, 5, 24, 32, 3)
     """
-    required(psi, ImagingMatrix, "psi", PSI_TAKES)
+    required(psi, Psi, "psi", PSI_TAKES)
     required(method, str, "method", "the name of a method, such as 'adaptive'")
     needs_dictionary = find_method(method).needs_dictionary
     chosen = settings_of(settings)
@@ -127,7 +127,7 @@ def settings_of(settings: MethodSettings | Mapping[str, Any] | None) -> MethodSe
 
 
 def _solved(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     method: str,
     dictionary: Dictionary | str | None,
@@ -146,7 +146,7 @@ def _solved(
 
 
 def as_frames(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames | ArrayLike,
     noise_sigma: float | None,
     usable: NDArray[np.bool_] | None,
@@ -200,7 +200,7 @@ def _refuse_codes(readings: NDArray) -> None:
         )
 
 
-def sensor_deviation(psi: ImagingMatrix, readings: NDArray[np.floating]) -> NDArray[np.floating]:
+def sensor_deviation(psi: Psi, readings: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the standard deviation that the sensor of Psi's camera adds to readings.
 
     Infinite where no light reaches a pixel. Raises AppError where Psi does not know its camera.
@@ -287,7 +287,7 @@ def reconstruct_undrawn(
     return metrics, partial(result.draw, metrics=metrics, truth=true)
 
 
-def _result_of_blocks(blocks: Blocks, psi: ImagingMatrix, frames: Frames) -> Result:
+def _result_of_blocks(blocks: Blocks, psi: Psi, frames: Frames) -> Result:
     """Return the result of a capture whose blocks are done, its arrays in memory."""
     arrays = {name: np.empty(*shape) for name, shape in blocks.shapes().items()}
     for name, array in arrays.items():
@@ -453,7 +453,7 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
 
 def open_frames(
     folder: str | Path, psi: str | Path | None = None, frame: int | None = None
-) -> tuple[ImagingMatrix, Frames]:
+) -> tuple[Psi, Frames]:
     """Return Psi and the frames of a folder: a session, a result, or what `simulate` wrote.
 
     psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, its

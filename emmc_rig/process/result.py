@@ -21,7 +21,7 @@ from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.lightfield import psnr_db, replicate_centre, ssim
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import Settings
 from emmc_rig.model.view_axes import ViewAxes, grid_name
 from emmc_rig.reconstruction.result import Reconstruction, Status
@@ -113,7 +113,7 @@ class Result(LightFieldArray):
 
     solved: Reconstruction
     verdict: Verdict
-    psi: ImagingMatrix
+    psi: Psi
     frames: Frames
     dictionary: str | None = None
     settings: Settings | None = None
@@ -360,7 +360,7 @@ class OpenedResult(Result):
         self.__dict__.update(saved=saved, solved=solved, verdict=verdict, dictionary=dictionary)
 
     @cached_property
-    def psi(self) -> ImagingMatrix:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def psi(self) -> Psi:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The imaging matrix; raises AppError where it is neither in the folder nor as named."""
         folder, known = self.saved.folder.absolute(), self.saved.metrics
         of_film = "segment" in known

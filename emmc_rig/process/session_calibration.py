@@ -25,7 +25,7 @@ from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import camera_of as camera_of_psi
 from emmc_rig.model.camera import json_of_shots
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.inputs import check_frames
 from emmc_rig.session.board_sets import camera_of, sensor_pairs, taken_shots
@@ -87,7 +87,7 @@ class SessionCalibration:
     inputs: dict[str, Any] | None = None
 
     @property
-    def psi(self) -> ImagingMatrix:
+    def psi(self) -> Psi:
         """The imaging matrix of the session's shots."""
         return self.calibration.psi
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from emmc_rig.calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.process.captures import Capture
 from emmc_rig.process.session_calibration import calibrated_scale
 from emmc_rig.progress import Watcher
@@ -50,7 +50,7 @@ class SessionCapture(Capture):
             own.save(out / PSI)
         return frames, psi or out / PSI
 
-    def loaded(self, psi: Path | None, place: int | None) -> tuple[ImagingMatrix, Frames]:
+    def loaded(self, psi: Path | None, place: int | None) -> tuple[Psi, Frames]:
         """Return Psi and readings."""
         own, frames = session_frames(self.session, self.scale(psi), place)
         return own if psi is None else StoredPsi(psi).load(), frames

@@ -24,7 +24,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.camera import camera_of, psi_layout
 from emmc_rig.model.pupil import Pupil
 from emmc_rig.model.reading import StoredArrays, stored_arrays
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.process.session_calibration import CALIBRATION_FILE
 from emmc_rig.store.folders import refuse_missing
 from emmc_rig.store.psi import FRAMES, PSI, read_frames
@@ -42,7 +42,7 @@ class Known:
     all colours.
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     mask: ShadowMask
     placement: Placement
     stages: Stages
@@ -54,7 +54,7 @@ class Known:
         """The mask as the pixels see it in white light."""
         return self.mask if self.seen is None else mixing(self.mask, self.seen)
 
-    def psi_after(self, placement: Placement) -> ImagingMatrix:
+    def psi_after(self, placement: Placement) -> Psi:
         """Return Psi with the mask there."""
         shadow = Shadow(self.mask, placement)
         psi = psi_at(shadow, self.psi, self.stages)
@@ -71,7 +71,7 @@ def read_calibration(folder: Path) -> Known:
     refuse_missing(folder, remedy)
     if not path.is_file() or not (folder / PSI).is_file():
         raise AppError(f"{folder}: holds no {CALIBRATION_FILE} and {PSI}; {remedy}")
-    psi = ImagingMatrix.load(folder / PSI)
+    psi = Psi.load(folder / PSI)
     camera = camera_of(psi)
     stages, k = shot_stages(camera), psi.binning
     placement = lost = seen = None
@@ -111,7 +111,7 @@ def _stored_placement(stored: StoredArrays) -> Placement:
     return Placement(**scalars, aperture=aperture, pupil=pupil)
 
 
-def _pixel_coefficients(psi: ImagingMatrix, values: Array) -> Array:
+def _pixel_coefficients(psi: Psi, values: Array) -> Array:
     """Return coefficients of the first shot by pixel, (v, u, stored colour, pixel_y, pixel_x).
 
     Each as what a white board before that view alone reads.
@@ -123,7 +123,7 @@ def _pixel_coefficients(psi: ImagingMatrix, values: Array) -> Array:
 
 
 def _planes_as_boards(
-    psi: ImagingMatrix,
+    psi: Psi,
     deviation: Array,
     good: NDArray[np.bool_] | None,
     colour: NDArray[np.uint8] | None,

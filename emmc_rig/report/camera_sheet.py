@@ -27,7 +27,7 @@ from emmc_rig.model.camera import (
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.geometry import centred_grid, fresnel_number, mask_position
 from emmc_rig.model.masks import cfa_tile
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.view_axes import grid_name, picture_name, place_name, shows_parallax
 from emmc_rig.report.drawing import FAINT, INK
 
@@ -163,7 +163,7 @@ def _label(axes: Axes, x: str) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _write_figures(axes: Axes, camera: Camera, psi: ImagingMatrix) -> None:
+def _write_figures(axes: Axes, camera: Camera, psi: Psi) -> None:
     axes.set_axis_off()
     lens = camera.lens
     open_mm = lens.aperture_cell_mm * lens.aperture_fill
@@ -240,7 +240,7 @@ def _draw_plate(axes: Axes, camera: Camera, plate: Plate, offset_um: tuple[float
     _label(axes, f"x, {name}")
 
 
-def _draw_weights(band: SubFigure, camera: Camera, psi: ImagingMatrix) -> None:
+def _draw_weights(band: SubFigure, camera: Camera, psi: Psi) -> None:
     """Draw the colour filters, and shot 0's weights: two views, and all of them together."""
     _band_title(band, "weights of shot 0: the share of light that passes, in each pixel's colours")
     passed = _transmittance(camera, psi)
@@ -269,7 +269,7 @@ def _crop(picture: NDArray[np.float32]) -> NDArray[np.float32]:
     return picture[max(top, 0) :, max(left, 0) :][:WEIGHTS_SHOWN, :WEIGHTS_SHOWN]
 
 
-def _transmittance(camera: Camera, psi: ImagingMatrix) -> NDArray[np.float32]:
+def _transmittance(camera: Camera, psi: Psi) -> NDArray[np.float32]:
     """Return what passes from every view in shot 0: (v, u, y, x, colour), 0 to 1."""
     response = sensor_response(camera, psi.size)[0]
     scale = camera.views[0] * camera.views[1] * camera.sensor.binning**2

@@ -23,7 +23,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.camera import Camera, build_imaging_matrix, psi_layout
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.reading import stored_arrays
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.progress import Watcher
 from emmc_rig.session.board_sets import (
     SessionBoards,
@@ -67,7 +67,7 @@ def open_scale(place: Path) -> Scale:
     file = place / PSI if place.is_dir() else place
     if not file.is_file():
         raise AppError(f"{place}: no Psi; name a session, the folder of a calibration or psi.h5")
-    psi, beside = ImagingMatrix.load(file), file.parent / CALIBRATION_FILE
+    psi, beside = Psi.load(file), file.parent / CALIBRATION_FILE
     if not beside.is_file():
         return designed_scale(psi)
     with stored_arrays(beside, AppError, "calibrate again") as stored:
@@ -286,7 +286,7 @@ def psi_is_assumed(session: Session) -> bool:
     return not any(frame.kind in ("whiteboard", "open") for frame in session.frames)
 
 
-def designed_psi(session: Session, frame: MeanFrame) -> ImagingMatrix:
+def designed_psi(session: Session, frame: MeanFrame) -> Psi:
     """Return Psi as the camera is designed, at the size of the frames captured."""
     camera = camera_of(session)
     k = camera.sensor.binning

@@ -12,7 +12,7 @@ import numpy as np
 from emmc_rig.calibration.scale import Scale
 from emmc_rig.errors import AppError
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.session.board_sets import decoded, taken_shots
 from emmc_rig.session.journal import FilmEntry, FrameEntry, of_kind
 from emmc_rig.session.measured_psi import session_scale
@@ -162,7 +162,7 @@ def _moment(entry: FrameEntry) -> tuple[int, float]:
 
 def session_frames(
     session: Session, scale: Scale | None = None, place: int | None = None
-) -> tuple[ImagingMatrix, Frames]:
+) -> tuple[Psi, Frames]:
     """Return Psi and the readings of the shots that a session needs, or of one frame of its film.
 
     scale: of the shots of the plan (default: see `session_scale`). place: of a film's frame, by its

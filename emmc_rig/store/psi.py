@@ -12,7 +12,7 @@ import numpy as np
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, ImagingMatrix, PsiLayout, checksum_of
+from emmc_rig.model.sensing import FORMAT, NO_COLOUR_MAP, Psi, PsiLayout, checksum_of
 from emmc_rig.model.view_axes import ATTRIBUTE, axes_from, stored_as
 from emmc_rig.store.folders import WRITTEN_BY, refuse_missing
 from emmc_rig.store.shards import CHUNK, SHARD, created_group, missing_value, stored_in
@@ -53,20 +53,20 @@ class StoredPsi(PsiLayout):
         if checksum != self.checksum:
             raise SensingError(f"{self._path}: damaged (its checksum differs); {AGAIN}")
 
-    def load(self) -> ImagingMatrix:
+    def load(self) -> Psi:
         """Return all of it, verified."""
         if self._path.is_file():
-            return ImagingMatrix.load(self._path)
+            return Psi.load(self._path)
         self.verify()
         return self.window(*(slice(0, length) for length in self.size))
 
-    def window(self, rows: slice, columns: slice) -> ImagingMatrix:
+    def window(self, rows: slice, columns: slice) -> Psi:
         """Return the imaging matrix of some samples; the slices are multiples of k."""
         with self._opened() as stored:
             weights = stored.part("weights", np.s_[:, :, :, rows, :, columns])
             has_colour = "colour" in stored
             colour = stored.part("colour", np.s_[:, rows, columns]) if has_colour else None
-        return ImagingMatrix(weights, colour, self.binning, self.camera_json, self.view_axes)
+        return Psi(weights, colour, self.binning, self.camera_json, self.view_axes)
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
@@ -81,7 +81,7 @@ def psi_beside(folder: Path) -> Path:
     return folder / (PSI_GROUP if (folder / PSI_GROUP).is_dir() else PSI)
 
 
-def save_shards(psi: ImagingMatrix, folder: Path) -> None:
+def save_shards(psi: Psi, folder: Path) -> None:
     """Write Psi as a Zarr group into a folder that must not exist; raises AppError without Zarr."""
     group = created_group(folder)
     shots, v, u, _, stored, _ = psi.weights.shape

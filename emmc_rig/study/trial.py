@@ -22,7 +22,7 @@ from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.dictionary import Dictionary, open_dictionary
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
 from emmc_rig.reconstruction.result import Reconstruction
@@ -100,7 +100,7 @@ class Capture:
             return _opened(self.scene, self.size, views, self.seed, self.zoom)
         return zoomed_scene(self.scene, self.size, views, self.seed, self.zoom, change)
 
-    def psi(self) -> ImagingMatrix:
+    def psi(self) -> Psi:
         """Return the Psi of the camera as designed, for the scene's size."""
         truth = self.scene_seen().light_field
         return build_imaging_matrix(self.described, (truth.shape[2], truth.shape[3]))
@@ -170,13 +170,13 @@ class Trial:
     unknown. peak: of the PSNR; below 1 where the scene has less contrast.
     """
 
-    psi: ImagingMatrix
+    psi: Psi
     readings: NDArray[np.float32]
     noise_sigma: float
     usable: NDArray[np.bool_]
     truth: Array
     disparity_px: Array | None
-    true_psi: ImagingMatrix
+    true_psi: Psi
     peak: float = 1.0
 
     def dictionary(self, method: str, spec: str | None = None) -> Dictionary | None:
@@ -206,7 +206,7 @@ def trial_of(
     capture: Capture,
     *,
     scene: Scene | None = None,
-    true_psi: ImagingMatrix | None = None,
+    true_psi: Psi | None = None,
     shot_scenes: list[Array] | None = None,
     change_clean: Callable[[Array], Array] | None = None,
     unusable: NDArray[np.bool_] | None = None,

@@ -13,7 +13,7 @@ from torch import Tensor
 from emmc_rig.model.errors import SensingError
 
 if TYPE_CHECKING:
-    from emmc_rig.model.sensing import ImagingMatrix
+    from emmc_rig.model.sensing import Psi
     from emmc_rig.torch.views_physics import ViewsPhysics
 
 SINGULAR = 1e-9
@@ -40,7 +40,7 @@ class TorchPsi:
     binning: int = 1
 
     @classmethod
-    def of(cls, psi: ImagingMatrix, device: Any = None) -> TorchPsi:
+    def of(cls, psi: Psi, device: Any = None) -> TorchPsi:
         """Return a copy of Psi."""
         colour = None if psi.colour is None else torch.tensor(psi.colour, device=device).long()
         return cls(torch.tensor(psi.weights, device=device), colour, psi.binning)
@@ -153,7 +153,7 @@ def _required(tensor: Tensor, shape: tuple[int, ...], what: str) -> Tensor:
     return tensor
 
 
-def physics(psi: ImagingMatrix | TorchPsi, usable: Any = None, **options: Any) -> ViewsPhysics:
+def physics(psi: Psi | TorchPsi, usable: Any = None, **options: Any) -> ViewsPhysics:
     """Return Psi as a `LinearPhysics` of deepinv, its data steps exact.
 
     Images x are (batch, 3, view, y, x), readings y (batch, shot, pixel_y, pixel_x). To deepinv,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_bands, summed_in_bands
 from emmc_rig.model.compiling import njit
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.lanes import (
     LANES,
     TAPS,
@@ -325,7 +325,7 @@ class Layout:
         summed_in_bands(work, len(self.rows), self.reach_rows)
 
 
-def _reach_rows(psi: ImagingMatrix, disparity: Array) -> float:
+def _reach_rows(psi: Psi, disparity: Array) -> float:
     """Return how many rows of pixels away from its own a pixel's taps lie, at most.
 
     disparity: (v, u, y, x).
@@ -336,7 +336,7 @@ def _reach_rows(psi: ImagingMatrix, disparity: Array) -> float:
 
 
 def laid_out(
-    psi: ImagingMatrix,
+    psi: Psi,
     disparity: Array,
     margin: int,
     shape: tuple[int, int, int],

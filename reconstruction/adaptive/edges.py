@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.settings import SIDES, Side
 
 Array = NDArray[np.floating]
@@ -85,7 +85,7 @@ def _dark_share(seen: Array, readings: Array) -> float:
 
 
 def dark_edges(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Array,
     usable: NDArray[np.bool_],
     sides: Collection[Side] = SIDES,
@@ -124,7 +124,7 @@ def dark_edges(
 
 def faded(
     edges: DarkEdges,
-    psi: ImagingMatrix,
+    psi: Psi,
     light_field: Array,
     frames: Array,
     usable: NDArray[np.bool_],

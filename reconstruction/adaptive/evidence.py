@@ -27,7 +27,7 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.evidence_kernels import SIZE, Hypotheses, evidence
 from emmc_rig.reconstruction.adaptive.register_tiles import LANES, SIDE
 from emmc_rig.reconstruction.errors import ReconstructionError
@@ -160,7 +160,7 @@ class PatchEvidence:
     kind: NDArray[np.int64]
 
 
-def _alike(psi: ImagingMatrix) -> bool:
+def _alike(psi: Psi) -> bool:
     """Return whether Psi is the same at every pixel, as that of a coded aperture alone."""
     row = psi.weights[:, :, :, :1]
     return bool((row == row[..., :1]).all() and (psi.weights == row).all())
@@ -229,7 +229,7 @@ def _trials(lengths: int, kinds: int, kept: int | None) -> NDArray[np.int64]:
 
 
 def patch_evidence(
-    psi: ImagingMatrix,
+    psi: Psi,
     data: Array,
     variance: Array,
     usable: NDArray[np.bool_],

@@ -28,7 +28,7 @@ from pydantic import Field, field_validator
 from emmc_rig.model.bands import in_views
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import Settings
 from emmc_rig.reconstruction.adaptive import mixture, search
 from emmc_rig.reconstruction.adaptive.fits import Fits
@@ -148,7 +148,7 @@ class Film:
         return {"about": np.array(about), **arrays}
 
     @classmethod
-    def restored(cls, arrays: Mapping[str, NDArray], psis: Sequence[ImagingMatrix]) -> Film:
+    def restored(cls, arrays: Mapping[str, NDArray], psis: Sequence[Psi]) -> Film:
         """Return the film whose `arrays` these are.
 
         psis: the Psi of one shot for each frame of `known.earlier`, as given to `reconstruct`.
@@ -185,7 +185,7 @@ class Film:
         known = Known(plain.scale, margin, rest, texture, centre, beliefs, missed, kept)
         return replace(self, known=known)
 
-    def shown(self, psi: ImagingMatrix) -> list[tuple[Readings, Array]]:
+    def shown(self, psi: Psi) -> list[tuple[Readings, Array]]:
         """Return frames before, each with its picture, where masks move; none of masks that rest.
 
         psi: of the present frame. Raises ReconstructionError for another size.

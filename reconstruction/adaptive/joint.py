@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import Settings
 from emmc_rig.reconstruction.adaptive.rays import Surfaces
 from emmc_rig.reconstruction.adaptive.refine import Seen, fitted, refined
@@ -93,22 +93,20 @@ class FittedScene:
     begun: Begun
 
 
-def surfaces_of(
-    psi: ImagingMatrix, padded: Array, margin: int, nearer: int, colours: int = 3
-) -> Surfaces:
+def surfaces_of(psi: Psi, padded: Array, margin: int, nearer: int, colours: int = 3) -> Surfaces:
     """Return Psi of the surfaces of the centre view's disparity, padded by a margin (y, x)."""
     disparity, hidden = carried(padded, margin, nearer, psi.light_field_shape[:4])
     return Surfaces(psi, disparity, hidden, margin, colours)
 
 
-def margin_of(psi: ImagingMatrix, centre: Array, room_px: float) -> int:
+def margin_of(psi: Psi, centre: Array, room_px: float) -> int:
     """Return by how many samples views of the centre view's disparity see beyond it, at most."""
     furthest = float(np.abs(centre).max()) + room_px
     return int(np.ceil(furthest * (max(psi.light_field_shape[:2]) // 2))) + 4
 
 
 def solve(
-    psi: ImagingMatrix,
+    psi: Psi,
     centre: Array,
     nearer: int,
     frames: Array,

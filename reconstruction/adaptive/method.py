@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.compiling import running_s
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive import mixture, search
 from emmc_rig.reconstruction.adaptive.edges import DarkEdges, dark_edges, faded
 from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
@@ -69,7 +69,7 @@ middles of group A (96x96, one CFA shot) 11 to 100 % of such patches decide, of 
 
 
 def reconstruct_adaptive(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     settings: AdaptiveSettings | None = None,
     on_step: Callable[[Progress], None] | None = None,
@@ -90,7 +90,7 @@ def reconstruct_adaptive(
 
 
 def reconstruct_next(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     film: Film,
     settings: AdaptiveSettings,
@@ -196,7 +196,7 @@ def _resting(
 
 
 def reconstruct_moving(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     settings: AdaptiveSettings,
     on_step: Callable[[Progress], None] | None = None,

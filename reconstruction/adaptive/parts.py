@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import Settings
 
 KIND = "class"
@@ -31,7 +31,7 @@ def to_arrays(value: Any, arrays: dict[str, NDArray]) -> Any:
         arrays[name] = np.asarray(value, order="C")
         return {KIND: "array", "name": name}
     kind = {KIND: type(value).__name__}
-    if isinstance(value, ImagingMatrix):
+    if isinstance(value, Psi):
         return kind
     if isinstance(value, Settings):
         return kind | {"settings": value.model_dump(mode="json")}
@@ -44,7 +44,7 @@ def from_arrays(
     plain: Any,
     arrays: Mapping[str, NDArray],
     kinds: Iterable[type],
-    next_psi: Callable[[], ImagingMatrix],
+    next_psi: Callable[[], Psi],
 ) -> Any:
     """Return the value that `to_arrays` was given.
 
@@ -61,7 +61,7 @@ def from_arrays(
         kind = part[KIND]
         if kind == "array":
             return arrays[part["name"]][()]
-        if kind == ImagingMatrix.__name__:
+        if kind == Psi.__name__:
             return next_psi()
         if "settings" in part and issubclass(known[kind], Settings):
             return known[kind].model_validate(part["settings"])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.assembly import Layout, laid_out
 from emmc_rig.reconstruction.adaptive.lanes import TAPS, read_taps
 
@@ -113,7 +113,7 @@ class Surfaces:
 
     def __init__(
         self,
-        psi: ImagingMatrix,
+        psi: Psi,
         disparity: Array,
         hidden: NDArray[np.uint8],
         margin: int,
@@ -188,7 +188,7 @@ class Surfaces:
 
         in_bands(work, psi.size[0])
         colours = np.zeros((psi.shots, *psi.size), np.uint8)
-        steep_psi = ImagingMatrix(steep, colours, psi.binning)
+        steep_psi = Psi(steep, colours, psi.binning)
         alike = self._whole if psi.weights.shape[4] == 1 else None
         return Surfaces(steep_psi, self.disparity, self.hidden, self.margin, 1, alike)
 

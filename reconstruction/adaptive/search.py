@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.evidence import (
     EvidencePatches,
     PatchEvidence,
@@ -156,7 +156,7 @@ class SearchData:
     brightness: Array
 
     @property
-    def psi(self) -> ImagingMatrix:
+    def psi(self) -> Psi:
         """Psi of the residual."""
         return self.residual.psi
 

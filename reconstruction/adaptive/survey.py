@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import centre_view
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive import mixture, search
 from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
@@ -69,7 +69,7 @@ PASSED = 0.5
 """Share of the light that masks pass for which the settings were chosen."""
 
 
-def checked(psi: ImagingMatrix, frames: Frames) -> Readings:
+def checked(psi: Psi, frames: Frames) -> Readings:
     """Return the readings of frames, scaled as if the masks passed half the light.
 
     Raises ReconstructionError for frames that do not fit Psi.
@@ -78,7 +78,7 @@ def checked(psi: ImagingMatrix, frames: Frames) -> Readings:
     return Readings.of(psi, frames).over(passed / PASSED, of_psi=True)
 
 
-def checked_disparity(disparity: Array, psi: ImagingMatrix) -> Array:
+def checked_disparity(disparity: Array, psi: Psi) -> Array:
     """Return a known disparity of the centre view as float32; raises ReconstructionError."""
     if disparity.shape != psi.size or not np.isfinite(disparity).all():
         raise ReconstructionError(
@@ -190,7 +190,7 @@ def surveyed(
 
 
 def contrast_of(
-    psi: ImagingMatrix, frames: Array, picture: Array, noise: Array, usable: NDArray[np.bool_]
+    psi: Psi, frames: Array, picture: Array, noise: Array, usable: NDArray[np.bool_]
 ) -> float:
     """Return the standard deviation of a scene's values, as far as frames (shot, y, x) show it.
 

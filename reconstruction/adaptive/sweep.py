@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.bands import in_bands
 from emmc_rig.model.compiling import njit
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.lanes import CUBIC, TAPS
 from emmc_rig.reconstruction.adaptive.rays import Surfaces
 from emmc_rig.reconstruction.adaptive.search import (
@@ -116,7 +116,7 @@ def _see(weights, colour, texture, disparity, margin, binning, first, last, fram
                 frames[s, y // binning, x // binning] += sums[s, x]
 
 
-def plane_frames(psi: ImagingMatrix, texture: Array, disparity: float, margin: int) -> Array:
+def plane_frames(psi: Psi, texture: Array, disparity: float, margin: int) -> Array:
     """Return the frames (shot, pixel_y, pixel_x) of a texture (c, y, x) on one plane.
 
     texture: padded by a margin, which the rays of the outermost views must not leave.

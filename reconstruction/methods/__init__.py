@@ -19,7 +19,7 @@ from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.compiling import compiling_s, running_s
 from emmc_rig.model.errors import nearest_of
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.film import Film
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import ReconstructionError
@@ -72,7 +72,7 @@ def find_method(name: str) -> Method:
 @one_blas_thread()
 def reconstruct(
     name: str,
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,

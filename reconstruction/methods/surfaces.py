@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.method import (
     reconstruct_adaptive,
     reconstruct_moving,
@@ -32,12 +32,12 @@ PATCH_TV_RTOL = 1e-3
 3e-3 costs 0.01 dB, and antinous 0.1."""
 
 
-def patch_of(psi: ImagingMatrix) -> tuple[int, int]:
+def patch_of(psi: Psi) -> tuple[int, int]:
     """Return rows and columns of the patches that `adaptive` averages with."""
     return usual_patch(psi.binning, psi.shots, psi.views)
 
 
-def sparse_patches(settings: SparseSettings, psi: ImagingMatrix) -> SparseSettings:
+def sparse_patches(settings: SparseSettings, psi: Psi) -> SparseSettings:
     """Return the settings of the patches that `adaptive` averages with.
 
     Patches lie at most two thirds of their width apart, cut no pixel, and are less exact.
@@ -49,14 +49,14 @@ def sparse_patches(settings: SparseSettings, psi: ImagingMatrix) -> SparseSettin
     return settings.model_copy(update={"stride": stride, "solver": solver})
 
 
-def patches_fit(psi: ImagingMatrix, settings: AdaptiveSettings) -> bool:
+def patches_fit(psi: Psi, settings: AdaptiveSettings) -> bool:
     """Return whether `adaptive` may average with sparse patches: if one fits."""
     return settings.patches is not None and min(psi.size) >= max(
         usual_patch(psi.binning, psi.shots)
     )
 
 
-def _patches(psi: ImagingMatrix, settings: ShippedSettings) -> SparseSettings | None:
+def _patches(psi: Psi, settings: ShippedSettings) -> SparseSettings | None:
     """Return the patches that `adaptive` averages with whatever the scene: from so many shots."""
     adaptive = settings.adaptive
     if not (patches_fit(psi, adaptive) and adaptive.uses_patches(psi.shots)):

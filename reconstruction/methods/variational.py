@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.compiling import running_s
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.method import Given, Method, Sensitivity, ShippedSettings, cost_words
 from emmc_rig.reconstruction.problem import PatchTerm, choose_mu
@@ -25,7 +25,7 @@ def patched_weights(
     tv: TVSettings,
     sparse: SparseSettings,
     patch: tuple[int, int],
-    psi: ImagingMatrix,
+    psi: Psi,
     readings: Array,
     noise_sigma: float,
 ) -> TVSettings:

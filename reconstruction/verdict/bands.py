@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 FURTHEST_PX = 8
 """Shifts that are tried."""
@@ -20,7 +20,7 @@ ALIKE, APART_PX = 0.8, 0.25
 """Least correlation of neighbouring bands' masks, and the most that their shifts differ."""
 
 
-def mask_shift_px(psi: ImagingMatrix) -> float | None:
+def mask_shift_px(psi: Psi) -> float | None:
     """Return the shift of Psi's masks from a picture to the next along its only axis of pictures.
 
     In pixels, without a sign. None where the pictures have two axes, and where masks differ from

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.camera import Camera, camera_of, draw_plates, seen_of_white
 from emmc_rig.model.errors import ModelError, SensingError
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.verdict.shadow import (
     LEAST_RELIEF,
     SMOOTH_PX,
@@ -110,7 +110,7 @@ def moved_masks(camera: Camera, dy_um: float, dx_um: float, distance: float) -> 
     return camera.model_copy(update={"shots": tuple(shots), "masks": masks})
 
 
-def known_camera(psi: ImagingMatrix) -> Camera | None:
+def known_camera(psi: Psi) -> Camera | None:
     """Return the camera of a Psi, None where it is not known or has no mask near the sensor."""
     try:
         camera = camera_of(psi)
@@ -126,7 +126,7 @@ def near_masks(camera: Camera) -> list[str]:
     return [name for name, mask in camera.masks.items() if mask.distance_mm < half_mm]
 
 
-def displaced(psi: ImagingMatrix, relief: Relief) -> Displaced:
+def displaced(psi: Psi, relief: Relief) -> Displaced:
     """Return by how much the masks lie off, and every cause alone."""
     design = _design(psi, relief)
     shifts = () if design is None else design.shifts
@@ -151,7 +151,7 @@ def _tiled(relief: Relief, shift_y: Array, shift_x: Array) -> _Regression | None
     return _regressed([relief.masks, shift_y, shift_x], relief.seen, relief.weight, tiles=True)
 
 
-def _design(psi: ImagingMatrix, relief: Relief) -> _Design | None:
+def _design(psi: Psi, relief: Relief) -> _Design | None:
     """Return the changes of the masks' shadow by the camera's design; None for a Psi of another
     design."""
     camera = known_camera(psi)
@@ -192,7 +192,7 @@ def _design(psi: ImagingMatrix, relief: Relief) -> _Design | None:
     )
 
 
-def _of_readings(psi: ImagingMatrix, relief: Relief) -> Iterator[tuple[str, Array]]:
+def _of_readings(psi: Psi, relief: Relief) -> Iterator[tuple[str, Array]]:
     """Yield what a wrong black level or a tone curve makes of the masks' modulation, by name."""
     if float(np.mean(np.square(relief.masks))) < LEAST_RELIEF**2:
         return
@@ -205,7 +205,7 @@ def _of_readings(psi: ImagingMatrix, relief: Relief) -> Iterator[tuple[str, Arra
     yield "contrast", -relief.masks
 
 
-def _blurs(psi: ImagingMatrix, relief: Relief) -> Iterator[tuple[str, Array]]:
+def _blurs(psi: Psi, relief: Relief) -> Iterator[tuple[str, Array]]:
     """Yield what each of BLURS_PX changes of Psi's own shadow, over its variance."""
     if float(np.mean(np.square(relief.masks))) < LEAST_RELIEF**2:
         return
@@ -294,7 +294,7 @@ def _correlation(own: Array, other: Array) -> float:
     return abs(float(np.mean(own * other))) / max(float(np.sqrt(squares)), 1e-12)
 
 
-def _vignetted(psi: ImagingMatrix, lost: float) -> Array:
+def _vignetted(psi: Psi, lost: float) -> Array:
     """Return the sum of Psi's weights over the views, (shot, y, stored colour, x), the outermost
     views darker by a share, those between by its square law."""
     v, u = (np.arange(n) - (n - 1) / 2 for n in psi.views)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.lightfield import centre_view, sum_of_squares
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, shows_parallax
 from emmc_rig.reconstruction.colour import unseen_colour
 from emmc_rig.reconstruction.result import SCALE, Reconstruction
@@ -136,7 +136,7 @@ class FittedFrames:
 
 
 def gathered(
-    psi: ImagingMatrix,
+    psi: Psi,
     fitted: FittedFrames,
     result: Reconstruction,
     relief: Relief | None = None,
@@ -193,7 +193,7 @@ def gathered(
     )
 
 
-def _shifts_px(psi: ImagingMatrix, result: Reconstruction) -> tuple[float, float] | None:
+def _shifts_px(psi: Psi, result: Reconstruction) -> tuple[float, float] | None:
     """Return `Evidence.shifts_px`."""
     if "band" not in psi.view_axes or "shift" not in result.maps:
         return None
@@ -201,9 +201,7 @@ def _shifts_px(psi: ImagingMatrix, result: Reconstruction) -> tuple[float, float
     return None if of_masks is None else (abs(float(np.median(result.maps["shift"]))), of_masks)
 
 
-def _colour_error(
-    psi: ImagingMatrix, frames: Array, usable: NDArray[np.bool_], relief: Relief
-) -> float:
+def _colour_error(psi: Psi, frames: Array, usable: NDArray[np.bool_], relief: Relief) -> float:
     """Return `Evidence.colour_error`."""
     unseen = unseen_colour(psi, frames, usable, relief.picture)
     square = np.square(relief.picture.mean(axis=-1, dtype=np.float64)).mean()

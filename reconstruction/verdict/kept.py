@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.problem import choose_mu
 from emmc_rig.reconstruction.tv import few_steps
 from emmc_rig.reconstruction.verdict.readings import neighbours
@@ -30,9 +30,7 @@ WINDOW_PX = 9
 """Side of the square that a place is judged by: 81 readings a shot distinguish 1 from 1.25."""
 
 
-def kept_readings(
-    psi: ImagingMatrix, usable: NDArray[np.bool_], seed: int = SEED
-) -> NDArray[np.bool_]:
+def kept_readings(psi: Psi, usable: NDArray[np.bool_], seed: int = SEED) -> NDArray[np.bool_]:
     """Return a random selection of usable readings (shot, pixel_y, pixel_x) to keep from the fit.
 
     A reading is selected by its pixel and by the weights of its shot: the order of the shots in Psi
@@ -69,7 +67,7 @@ def compare_held_out(
 
 
 def missed_readings(
-    psi: ImagingMatrix,
+    psi: Psi,
     light_field: Array,
     readings: Array,
     deviation: Array | float,
@@ -96,7 +94,7 @@ def missed_readings(
 
 
 def over_baselines(
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Array,
     residual: Array,
     noise_sigma: float,
@@ -123,9 +121,7 @@ def over_baselines(
     }
 
 
-def _off_neighbours(
-    psi: ImagingMatrix, frames: Array, good: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+def _off_neighbours(psi: Psi, frames: Array, good: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return what readings differ by from the mean of those beside, (shot, pixel_y, pixel_x)."""
     step = 1 if psi.colour is None or psi.binning > 1 else 2
     return np.stack(

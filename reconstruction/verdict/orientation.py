@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_filter
 
 from emmc_rig.model.camera import Camera, Plate, draw_plates, seen_of_white
 from emmc_rig.model.errors import ModelError
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.verdict.displaced import known_camera, moved_masks, near_masks
 from emmc_rig.reconstruction.verdict.shadow import (
     SMOOTH_PX,
@@ -117,7 +117,7 @@ class Seen(NamedTuple):
         return bool(self.change) and self.size in (SIZES[self.change][0], SIZES[self.change][-1])
 
 
-def seen_masks(psi: ImagingMatrix, relief: Relief) -> Seen | None:
+def seen_masks(psi: Psi, relief: Relief) -> Seen | None:
     """Return how the masks stand, where they stand clearly otherwise than in Psi; else None.
 
     None as well for a Psi without a design, and for masks at the lens.
@@ -154,7 +154,7 @@ class _Detail(NamedTuple):
     good: NDArray[np.bool_]
 
 
-def _detail(psi: ImagingMatrix, relief: Relief) -> _Detail:
+def _detail(psi: Psi, relief: Relief) -> _Detail:
     good, filters = relief.good, channels(psi)
     read = relief.level * (1 + relief.read)
     around = averaged(read, good, filters, SMOOTH_PX)
@@ -176,7 +176,7 @@ def _two_peaks(tried: _Correlated) -> Iterator[tuple[int, int]]:
 
 
 def _hypotheses(
-    psi: ImagingMatrix, camera: Camera, picture: Array
+    psi: Psi, camera: Camera, picture: Array
 ) -> Iterator[tuple[NDArray[np.float32], Seen]]:
     """Yield what the masks near the sensor add to the readings, as they may stand in the bench."""
     plates, near = draw_plates(camera, psi.size), near_masks(camera)

@@ -19,7 +19,7 @@ from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import measured_views
 from emmc_rig.model.compiling import compiling_s
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.view_axes import shows_parallax
 from emmc_rig.reconstruction.adaptive.film import Film
 from emmc_rig.reconstruction.dictionary import Dictionary
@@ -47,7 +47,7 @@ is 1.5 to 12. Smaller motion is found from the light field, after the first fit.
 @one_blas_thread()
 def reconstruct_judged(
     name: str,
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Frames,
     dictionary: Dictionary | None = None,
     settings: MethodSettings | None = None,
@@ -100,7 +100,7 @@ class _Fitting:
     def __init__(
         self,
         name: str,
-        psi: ImagingMatrix,
+        psi: Psi,
         read: FittedFrames,
         notes: tuple[str, ...],
         solve: Callable[[Frames, bool], Reconstruction],
@@ -197,16 +197,14 @@ def _moved(found: Motion | None, least: float) -> bool:
     return found is not None and found.shot is None and found.ratio > least
 
 
-def named_maps(maps: Mapping[str, NDArray], psi: ImagingMatrix) -> dict[str, NDArray]:
+def named_maps(maps: Mapping[str, NDArray], psi: Psi) -> dict[str, NDArray]:
     """Return a method's maps; what it calls disparity is a shift where views are no angles."""
     if shows_parallax(psi.view_axes):
         return dict(maps)
     return {name.replace("disparity", "shift"): values for name, values in maps.items()}
 
 
-def _as_fitted(
-    psi: ImagingMatrix, frames: Frames, screening: bool
-) -> tuple[FittedFrames, tuple[str, ...]]:
+def _as_fitted(psi: Psi, frames: Frames, screening: bool) -> tuple[FittedFrames, tuple[str, ...]]:
     """Return the frames for a method, and notes about their preparation."""
     checked, excluded = checked_inputs(psi, frames), np.where(frames.usable, 0, frames.readings)
     if not screening:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.model.frames import local_mean
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.problem import smooth_guess
 
 Array = NDArray[np.floating]
@@ -52,7 +52,7 @@ class Relief:
     picture: Array
 
 
-def channels(psi: ImagingMatrix) -> NDArray[np.int64]:
+def channels(psi: Psi) -> NDArray[np.int64]:
     """Return which filter of the sensor each pixel has, (shot, pixel_y, pixel_x)."""
     k = psi.binning
     if psi.colour is None:
@@ -67,7 +67,7 @@ def averaged(values: Array, good: NDArray, filters: NDArray[np.int64], deviation
 
 
 def predicted_relief(
-    psi: ImagingMatrix, white: Array, picture: Array
+    psi: Psi, white: Array, picture: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return what a picture (y, x, c), seen in all views, makes a Psi read.
 
@@ -94,7 +94,7 @@ def predicted_relief(
 
 
 def measured_relief(
-    psi: ImagingMatrix, frames: Array, noise_sigma: float, usable: NDArray[np.bool_]
+    psi: Psi, frames: Array, noise_sigma: float, usable: NDArray[np.bool_]
 ) -> Relief:
     """Return readings and masks around the smooth picture."""
     picture = np.asarray(smooth_guess(psi, frames, usable), dtype=np.float32)

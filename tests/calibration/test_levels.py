@@ -11,7 +11,7 @@ from emmc_rig.calibration.frames import MeanFrame, SensorGain
 from emmc_rig.calibration.levels import Check, fit_levels
 from emmc_rig.calibration.misfit import combined
 from emmc_rig.calibration.whiteboard import Calibration
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 WARM_UP_S = 120.0
 
@@ -88,7 +88,7 @@ def test_a_dark_frame_far_from_those_taken_is_known_worse():
 def random_psi(seed=0, views=(5, 5), size=(40, 48)):
     rng = np.random.default_rng(seed)
     weights = rng.random((1, *views, size[0], 1, size[1])).astype(np.float32) / 25
-    return ImagingMatrix(weights, np.zeros((1, *size), np.uint8))
+    return Psi(weights, np.zeros((1, *size), np.uint8))
 
 
 def open_board(psi, radiance, noise, rng):
@@ -106,9 +106,7 @@ def test_a_turned_board_separates_its_unevenness_from_the_cameras():
     psi, rng = random_psi(), np.random.default_rng(1)
     v = np.linspace(-1, 1, 5)
     true = 1 + 0.03 * v + 0.02 * v[:, None] + 0.01 * (v**2 - v[:, None] ** 2)
-    measured = ImagingMatrix(
-        psi.weights * true[None, :, :, None, None, None].astype(np.float32), psi.colour
-    )
+    measured = Psi(psi.weights * true[None, :, :, None, None, None].astype(np.float32), psi.colour)
     turned = {90.0 * n: open_board(psi, np.rot90(true, -n), 1e-3, rng) for n in (1, 2)}
     found = board_over_angle(measured, turned)
     assert found.uneven
@@ -124,7 +122,7 @@ def test_a_turned_board_separates_its_unevenness_from_the_cameras():
 def test_an_error_of_psi_is_no_unevenness_of_the_board():
     psi, rng = random_psi(), np.random.default_rng(1)
     wrong = 1 + 0.05 * np.linspace(-1, 1, 5)[:, None] ** 2 + 0.03 * np.linspace(-1, 1, 5)
-    measured = ImagingMatrix(psi.weights * wrong[None, :, :, None, None, None], psi.colour)
+    measured = Psi(psi.weights * wrong[None, :, :, None, None, None], psi.colour)
     turned = {90.0 * n: open_board(psi, np.ones((5, 5)), 1e-3, rng) for n in range(4)}
     assert not board_over_angle(measured, turned).uneven
     without = {turn: board for turn, board in turned.items() if turn}
@@ -146,7 +144,7 @@ def calibrations(misfit, seed=0, noise=1e-3):
 
     def known(weights, deviation):
         spread = np.full(weights.shape, deviation, np.float32)
-        return Calibration(ImagingMatrix(weights, psi.colour), spread, frame, frame, gain)
+        return Calibration(Psi(weights, psi.colour), spread, frame, frame, gain)
 
     measured = psi.weights + noise * rng.standard_normal(psi.weights.shape).astype(np.float32)
     model = psi.weights.copy()

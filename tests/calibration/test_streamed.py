@@ -11,7 +11,7 @@ import emmc_rig as emmc
 from emmc_rig.calibration import frames
 from emmc_rig.captures.board_plan import PLAN, PlanSettings, write_plan
 from emmc_rig.formats.cameras import find_camera
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 NAME, SIZE = "rgbw-bayer-1shot", (48, 64)
 
@@ -31,7 +31,7 @@ def test_psi_on_disk_is_psi_in_memory(session, tmp_path, monkeypatch):
     monkeypatch.setattr(frames, "BAND_PIXELS", 5 * SIZE[1])
     out = tmp_path / "streamed"
     assert exit_code("calibrate", session.folder, "--method", "free", "--out", out) == 0
-    psi = ImagingMatrix.load(out / "psi.h5")
+    psi = Psi.load(out / "psi.h5")
     np.testing.assert_allclose(psi.weights, whole.psi.weights, rtol=1e-6, atol=1e-9)
     assert psi.camera_json == whole.psi.camera_json
     np.testing.assert_array_equal(psi.colour, whole.psi.colour)

@@ -16,7 +16,7 @@ from watching import Acting
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.captures.until import Until, stated_psnr_db
 from emmc_rig.errors import AppError
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.result import Reconstruction, Status
 from emmc_rig.report.session_sheet import events, sheet
 from emmc_rig.session.journal import DecidedEntry, UntilEntry, of_kind
@@ -137,7 +137,7 @@ def test_its_page_shows_what_was_decided_and_when(every):
 
 def test_it_is_calibrated_reconstructed_and_exported_with_the_shots_it_has(enough, tmp_path):
     done(program("calibrate", enough, "--out", tmp_path / "c"))
-    psi = ImagingMatrix.load(tmp_path / "c" / "psi.h5")
+    psi = Psi.load(tmp_path / "c" / "psi.h5")
     assert psi.shots == 1
     settings = tmp_path / "s.yaml"
     settings.write_text("tv: {max_steps: 3}")

@@ -19,7 +19,7 @@ from scipy import sparse
 import emmc_rig as emmc
 from emmc_rig.formats import scenes
 from emmc_rig.model.lightfield import load_hdf5, psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 SNIPPET = """
 import emmc_rig as emmc
@@ -98,7 +98,7 @@ def test_a_session_goes_on_without_its_rig_and_calibrates_to_a_folder(tmp_path, 
     assert emmc.capture(session.folder).stored == session.stored
     calibration = emmc.calibrate(session)
     calibration.save("psi")
-    saved = ImagingMatrix.load(tmp_path / "psi" / "psi.h5")
+    saved = Psi.load(tmp_path / "psi" / "psi.h5")
     np.testing.assert_array_equal(saved.weights, calibration.psi.weights)
     assert "validation error" in repr(calibration)
     assert "32x48" in repr(calibration)
@@ -119,7 +119,7 @@ def test_an_array_of_readings_is_taken_with_the_noise_of_the_sensor(taken):
 
 def test_an_array_for_a_psi_of_no_known_camera_needs_its_noise(taken):
     _, psi, frames = taken
-    unknown = ImagingMatrix(psi.weights, psi.colour, psi.binning)
+    unknown = Psi(psi.weights, psi.colour, psi.binning)
     with pytest.raises(emmc.ERRORS, match="give the readings' noise_sigma"):
         emmc.reconstruct(unknown, frames.readings)
     with pytest.raises(emmc.ERRORS, match="frames of shape"):

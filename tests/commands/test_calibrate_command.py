@@ -22,7 +22,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene
 from emmc_rig.model.frames import Frames
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.process.session_drift import run_drift
 from emmc_rig.simulators.effects import ORDINARY, TOGETHER, Flaws, flawed
 from emmc_rig.store.results import save_frames, write_metrics
@@ -66,7 +66,7 @@ def calibrate_into(folder, camera, size=(48, 64), **settings):
 def test_calibrate_writes_psi_its_uncertainty_and_a_page(camera_file, tmp_path):
     out = tmp_path
     calibrate_into(out, find_camera(str(camera_file)), (32, 40), rays=64)
-    psi = ImagingMatrix.load(out / "psi.h5")
+    psi = Psi.load(out / "psi.h5")
     metrics = json.loads((out / "metrics.json").read_text())
     assert psi.size == (32, 40)
     assert set(metrics["psi_relative_error"]) == {"parametric", "mixed", "free", "combined"}
@@ -159,7 +159,7 @@ def test_the_error_of_psi_leaves_bad_pixels_out_and_counts_colours_not_stored(co
     spoilt = psi.weights.copy()
     spoilt[:, :, :, :2, :, :2] *= 3
     good = np.ones((4, 4), dtype=bool)
-    other = ImagingMatrix(spoilt, psi.colour, 2)
+    other = Psi(spoilt, psi.colour, 2)
     assert true_error(other, true, good) > 0.1
     good[0, 0] = False
     assert true_error(other, true, good) == 0
@@ -204,7 +204,7 @@ def test_that_the_mask_has_moved_is_reported_and_psi_mended(calibrated, tmp_path
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["values"]["shift_x_um"] == pytest.approx(9.0, abs=1.0)
     assert metrics["values"]["shift_y_um"] == pytest.approx(-8.0, abs=1.0)
-    before, after = (ImagingMatrix.load(folder / "psi.h5") for folder in (known, out))
+    before, after = (Psi.load(folder / "psi.h5") for folder in (known, out))
     true = WhiteboardBench(camera, (48, 64), moved).true_psi()
     good = np.ones((48, 64), dtype=bool)
     assert true_error(after, true, good) < 0.3 * true_error(before, true, good)
@@ -224,7 +224,7 @@ def test_a_free_psi_is_taken_too_and_a_mask_far_off_is_refused_with_nothing_writ
     reported = run_drift(known, frames_of(tmp_path / "frames", camera, moved), out, QUICK)
     assert reported["drifted"]
     assert reported["values"]["shift_x_um"] == pytest.approx(40.0, abs=1.0)
-    before, after = (ImagingMatrix.load(folder / "psi.h5") for folder in (known, out))
+    before, after = (Psi.load(folder / "psi.h5") for folder in (known, out))
     true = WhiteboardBench(camera, (48, 64), moved).true_psi()
     good = np.ones((48, 64), dtype=bool)
     assert true_error(after, true, good) < 0.2 * true_error(before, true, good)

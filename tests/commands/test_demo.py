@@ -15,7 +15,7 @@ from emmc_rig.formats.exports import open_export
 from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.lightfield import load_hdf5, psnr_db, replicate_centre
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.methods import MethodSettings
 from emmc_rig.reconstruction.tv import TVSettings
@@ -69,7 +69,7 @@ def test_another_command_compares_with_the_scene_as_the_demo_did(demo):
 
 def test_the_measured_psi_is_saved_with_its_camera(demo):
     folder, _, _ = demo
-    psi = ImagingMatrix.load(folder / "psi.h5")
+    psi = Psi.load(folder / "psi.h5")
     described = Camera.model_validate_json(psi.camera_json)
     assert described == find_camera("rgbw-bayer-3shots")
     with h5py.File(folder / "frames.h5") as file:

@@ -27,7 +27,7 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.decoding.child import read_in_child
 from emmc_rig.model.errors import SensingError
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.store.psi import StoredPsi, save_shards
 
 ROOT = Path(__file__).parents[2]
@@ -455,7 +455,7 @@ def test_a_psi_whose_camera_is_no_text_any_more_is_damaged(tmp_path):
     path = tmp_path / "psi.h5"
     psi.save(path)
     flipped_camera(path)
-    for read in (lambda: ImagingMatrix.load(path), StoredPsi(path).verify, StoredPsi(path).load):
+    for read in (lambda: Psi.load(path), StoredPsi(path).verify, StoredPsi(path).load):
         with pytest.raises(SensingError, match=r"psi\.h5: damaged \(its checksum differs\)"):
             read()
 
@@ -480,7 +480,7 @@ def test_a_psi_of_another_shape_is_refused_when_it_is_opened(tmp_path, change):
         else:
             del file["weights"]
             file["weights"] = np.zeros(change["weights"])
-    for read in (ImagingMatrix.load, StoredPsi):
+    for read in (Psi.load, StoredPsi):
         with pytest.raises(SensingError) as fault:
             read(path)
         assert "\n" not in str(fault.value)

@@ -16,7 +16,7 @@ from emmc_rig.calibration.openings import CENTRED, Window, views_open, window_pl
 from emmc_rig.calibration.whiteboard import LAMP_COLOURS
 from emmc_rig.model.camera import Camera, psi_layout
 from emmc_rig.model.geometry import centred_grid
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.simulators.bench import Bench, MountingErrors, window_side_um
 from emmc_rig.simulators.effects import ORDINARY, Flaws, flawed
 from emmc_rig.simulators.flaws import OpticsFlaws, SensorFlaws
@@ -258,7 +258,7 @@ class WhiteboardBench:
             found.append(self.bench.true_psi(shot))
         return np.stack(found)
 
-    def exact_psi(self, design: ImagingMatrix) -> ImagingMatrix:
+    def exact_psi(self, design: Psi) -> Psi:
         """Return the true Psi in the form of a design: of each pixel's own colour, or all."""
         true = self.true_psi()
         if design.colour is not None:

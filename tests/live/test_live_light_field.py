@@ -18,7 +18,7 @@ from emmc_rig.live.light_field import LiveLightField, disparity_of, live_scale
 from emmc_rig.model.errors import ModelError
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db, shifted
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.preview import Preview, coarser
 from emmc_rig.reconstruction.result import Progress, Reconstruction, Status
@@ -51,7 +51,7 @@ def random_psi(binning, colours, seed=0, size=(8, 12), shots=2):
     if colours == 1:
         pixels = rng.integers(0, 3, (shots, size[0] // binning, size[1] // binning))
         colour = pixels.repeat(binning, axis=1).repeat(binning, axis=2).astype(np.uint8)
-    return ImagingMatrix(weights, colour, binning)
+    return Psi(weights, colour, binning)
 
 
 @pytest.mark.parametrize(("binning", "colours"), [(1, 1), (1, 3), (2, 1), (2, 3)])
@@ -276,7 +276,7 @@ def test_a_psi_is_opened_with_what_lies_beside_it(tmp_path, one_shot):
     assert live_scale(tmp_path / "psi.h5").white_dn_per_s.shape == psi.frames_shape
     with pytest.raises(AppError, match="no Psi"):
         live_scale(tmp_path / "elsewhere")
-    nameless = ImagingMatrix(psi.weights, psi.colour)
+    nameless = Psi(psi.weights, psi.colour)
     nameless.save(tmp_path / "nameless.h5")
     with pytest.raises(ModelError, match="does not know its camera"):
         live_scale(tmp_path / "nameless.h5")

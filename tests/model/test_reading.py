@@ -27,7 +27,7 @@ from emmc_rig.model.json_text import parse_json
 from emmc_rig.model.lightfield import load_hdf5, load_views
 from emmc_rig.model.masks import Picture
 from emmc_rig.model.reading import parse_yaml, read_yaml, stored_arrays
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import validated
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import DictionaryError
@@ -219,7 +219,7 @@ def test_a_data_set_larger_than_its_file_can_hold_is_not_read(tmp_path):
 
 READERS = {
     "light field": (load_hdf5, SceneError),
-    "psi": (ImagingMatrix.load, SensingError),
+    "psi": (Psi.load, SensingError),
     "dictionary": (Dictionary.load, DictionaryError),
 }
 NAMES = ("light_field", "weights", "colour", "atoms", "provenance")

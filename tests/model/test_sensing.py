@@ -12,7 +12,7 @@ from emmc_rig.model.arguments import ArgumentError
 from emmc_rig.model.camera import Camera, build_imaging_matrix, draw_plates, sensor_response
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.masks import CFA
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 EPS = float(np.finfo(np.float32).eps)
 VIEWS = (2, 3)
@@ -175,7 +175,7 @@ def test_kernels_meet_one_layout_of_the_colour_map():
     weights = np.ones((2, 1, 1, 4, 1, 6), np.float32)
     colour = np.arange(48, dtype=np.uint8).reshape(2, 4, 6) % 3
     for given in (colour, colour[..., ::-1], np.broadcast_to(colour[:1], colour.shape)):
-        kept = ImagingMatrix(weights, given).colour
+        kept = Psi(weights, given).colour
         assert kept is not None
         assert kept.flags.c_contiguous
         np.testing.assert_array_equal(kept, given)
@@ -321,7 +321,7 @@ def test_psi_is_shown_in_one_line(coded_psi, random_psi):
 @pytest.mark.parametrize(("cfa", "binning", "shots"), [("rggb", 2, 2), ("mono", 1, 3)])
 def test_psi_in_double_precision_is_exact_to_double_precision(coded_camera, cfa, binning, shots):
     single = build_imaging_matrix(coded_camera("uniform_colour", cfa, binning, shots), SIZE)
-    psi = ImagingMatrix(single.weights.astype(np.float64), single.colour, binning)
+    psi = Psi(single.weights.astype(np.float64), single.colour, binning)
     dense = assert_operator_equals_matrix(psi)
     frames = random_frames(psi)
     solved = solved_blocks(psi, 0.1, frames)
@@ -361,12 +361,12 @@ def test_arrays_that_do_not_fit_are_refused():
 )
 def test_weights_that_make_no_psi_are_refused(weights, colour, binning, complaint):
     with pytest.raises(SensingError, match=complaint):
-        ImagingMatrix(weights.astype(np.float32), colour, binning)
+        Psi(weights.astype(np.float32), colour, binning)
 
 
 def test_the_relative_difference_is_the_frobenius_norms_ratio(coded_camera):
     psi = build_imaging_matrix(coded_camera("uniform_colour", "rggb"), SIZE)
-    other = ImagingMatrix(psi.weights * np.float32(1.25), psi.colour)
+    other = Psi(psi.weights * np.float32(1.25), psi.colour)
     assert other.relative_difference(psi) == pytest.approx(0.25)
     assert psi.relative_difference(psi) == 0
     with pytest.raises(SensingError, match="same camera and size"):
@@ -379,7 +379,7 @@ def test_psi_is_saved_and_loaded_unchanged(tmp_path, coded_camera, cfa):
     path = tmp_path / "psi.h5"
     psi.save(path)
     assert [item.name for item in tmp_path.iterdir()] == ["psi.h5"]
-    loaded = ImagingMatrix.load(path)
+    loaded = Psi.load(path)
     np.testing.assert_array_equal(loaded.weights, psi.weights)
     assert (loaded.colour is None) == (psi.colour is None)
     np.testing.assert_array_equal(loaded.colour_map, psi.colour_map)
@@ -401,7 +401,7 @@ def test_a_damaged_file_is_not_believed(tmp_path, coded_camera, damage):
         else:
             file.attrs[damage] = {"binning": 1, "camera": "{}"}[damage]
     with pytest.raises(SensingError, match="damaged"):
-        ImagingMatrix.load(path)
+        Psi.load(path)
 
 
 def test_files_that_hold_no_psi_are_refused_in_one_line(tmp_path):
@@ -414,7 +414,7 @@ def test_files_that_hold_no_psi_are_refused_in_one_line(tmp_path):
     cut.write_bytes(cut.read_bytes()[:3000])
     for path in (text, other, missing, tmp_path, cut):
         with pytest.raises(SensingError) as fault:
-            ImagingMatrix.load(path)
+            Psi.load(path)
         assert "\n" not in str(fault.value)
         assert str(path) in str(fault.value)
 
@@ -499,16 +499,16 @@ def test_psi_is_the_average_over_dense_rays(masks, offsets, rays, tolerance):
 def test_weights_below_zero_by_more_than_noise_are_refused():
     weights = np.random.default_rng(0).random((1, 2, 2, 4, 6))
     weights[0, 1, 1, 2, 3] = -0.01
-    assert ImagingMatrix.from_weights(weights).shots == 1
+    assert Psi.from_weights(weights).shots == 1
     weights[0, 1, 1, 2, 3] = -0.5
     with pytest.raises(SensingError, match=r"weights down to -0\.5, and a pixel sees no less"):
-        ImagingMatrix.from_weights(weights)
+        Psi.from_weights(weights)
 
 
 def test_values_that_are_masked_are_not_taken():
     weights = np.random.default_rng(0).random((1, 2, 2, 4, 6))
     masked = np.ma.masked_less(weights, 0.1)
     with pytest.raises(ArgumentError, match=r"weights: \d+ of its values are masked"):
-        ImagingMatrix.from_weights(masked)
-    kept = ImagingMatrix.from_weights(np.ma.masked_array(weights))
-    assert np.array_equal(kept.weights, ImagingMatrix.from_weights(weights).weights)
+        Psi.from_weights(masked)
+    kept = Psi.from_weights(np.ma.masked_array(weights))
+    assert np.array_equal(kept.weights, Psi.from_weights(weights).weights)

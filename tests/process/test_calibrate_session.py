@@ -16,7 +16,7 @@ from emmc_rig.bench.hardware import NO_FLAWS
 from emmc_rig.captures.plan import load_plan
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.session import board_sets
 from emmc_rig.session.board_sets import camera_of
 from emmc_rig.session.readings import session_frames
@@ -68,14 +68,14 @@ def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captu
     assert np.degrees(found["rotation_rad"]) == pytest.approx(errors.rotation_deg, abs=0.01)
     session = Session(captured / "session")
     design = build_imaging_matrix(camera_of(session), SIZE)
-    psi = ImagingMatrix.load(out / "psi.h5")
+    psi = Psi.load(out / "psi.h5")
     assert design.relative_difference(psi) > 10 * judged["relative_error"]
     assert "session" in (out / "report.html").read_text()
 
 
 def test_a_session_is_read_by_the_psi_that_its_open_whiteboards_give(captured):
     used, found = session_frames(Session(captured / "session"))
-    psi = ImagingMatrix.load(captured / "calibration" / "psi.h5")
+    psi = Psi.load(captured / "calibration" / "psi.h5")
     np.testing.assert_allclose(used.weights, psi.weights, rtol=1e-4, atol=1e-6)
     assert found.usable.mean() > 0.95
     assert np.isfinite(found.readings[found.usable]).all()
@@ -86,7 +86,7 @@ def test_the_method_free_takes_the_same_session(captured):
     assert exit_code("calibrate", captured / "session", "--method", "free", "--out", out) == 0
     surest = json.loads((captured / "calibration" / "metrics.json").read_text())
     assert surest["chosen"] in ("combined", "free")
-    free, both = (ImagingMatrix.load(item / "psi.h5") for item in (out, captured / "calibration"))
+    free, both = (Psi.load(item / "psi.h5") for item in (out, captured / "calibration"))
     assert free.relative_difference(both) < 0.01
 
 
@@ -141,7 +141,7 @@ def test_a_session_corrects_what_is_wrong_with_lamp_sensor_and_board(tmp_path, c
     camera, flaws = find_camera("rgbw-bayer-1shot"), flawed(NO_FLAWS, EFFECTS.split(","))
     settings = CalibrateSettings("", camera, SIZE, flaws=flaws, rays=1024)
     true = true_psi(camera, *rig_to_calibrate(settings))
-    psi = ImagingMatrix.load(out / "psi.h5")
+    psi = Psi.load(out / "psi.h5")
     with h5py.File(out / "calibration.h5") as stored:
         deviation, good = (np.asarray(stored[name]) for name in ("deviation", "good"))
     off = np.where(good[:, None, :], psi.weights - true, 0)
@@ -172,7 +172,7 @@ def test_what_a_rig_cannot_take_is_left_out_of_the_plan_and_named(tmp_path, caps
 
 
 def used_psi(folder):
-    return ImagingMatrix.load(folder / "psi.h5").checksum()
+    return Psi.load(folder / "psi.h5").checksum()
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import emmc_rig as emmc
 from emmc_rig.model.camera import measured_views
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.pupil import Pupil
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 SIZE = (36, 48)
 CORNERS = [[0, 0], [0, 4], [4, 0], [4, 4]]
@@ -43,7 +43,7 @@ def scene():
 def test_a_psi_says_which_views_it_measures(psi):
     measured = measured_views(psi)
     assert np.argwhere(~measured).tolist() == CORNERS
-    nameless = ImagingMatrix(psi.weights, psi.colour)
+    nameless = Psi(psi.weights, psi.colour)
     np.testing.assert_array_equal(measured_views(nameless), measured)
 
 

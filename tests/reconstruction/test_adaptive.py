@@ -12,7 +12,7 @@ from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import OPPONENT, centre_view, psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive import assembly, method, search
 from emmc_rig.reconstruction.adaptive.evidence import EvidencePatches, TexturePrior, patch_evidence
 from emmc_rig.reconstruction.adaptive.joint import TextureSettings, solve
@@ -402,7 +402,7 @@ def test_a_mask_that_treats_all_views_alike_decides_nothing():
     psi = build_imaging_matrix(camera, (40, 40))
     weights = np.zeros_like(psi.weights)
     weights[:, 1, 1] = 1 / 3
-    pinhole = ImagingMatrix(weights, psi.colour)
+    pinhole = Psi(weights, psi.colour)
     truth, _ = plane_scene(pinhole, 0.0, seed=1)
     found = reconstruct_adaptive(pinhole, even_frames(pinhole.forward(truth), 0.003), quick())
     assert found.parameters["decided"] < 0.25

@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.bpdn import BPDNSettings
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.reconstruction.errors import DictionaryError, ReconstructionError
@@ -127,11 +127,11 @@ def test_patches_of_equal_sensing_share_one_dictionary(random_psi, scene):
     tile = rng.uniform(size=(1, *VIEWS, 6, 1, 6)).astype(np.float32)
     weights = np.tile(tile, (1, 1, 1, 4, 1, 5))
     colour = np.tile(rng.integers(0, 3, (1, 6, 6), dtype=np.uint8), (1, 4, 5))
-    psi = ImagingMatrix(weights, colour)
+    psi = Psi(weights, colour)
     shared = solved(psi, truth, dictionary, settings("omp"))
     assert shared.parameters["classes"] == 1
     nudged = weights * (1 + 1e-6 * rng.uniform(size=weights.shape)).astype(np.float32)
-    apart = solved(ImagingMatrix(nudged, colour), truth, dictionary, settings("omp"))
+    apart = solved(Psi(nudged, colour), truth, dictionary, settings("omp"))
     assert apart.parameters["classes"] == 20
     np.testing.assert_allclose(shared.light_field, apart.light_field, atol=1e-3)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import emmc_rig as emmc
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.methods import reconstruct
 
 NOISE = 0.004
@@ -73,7 +73,7 @@ def mirrored_frames(frames, how):
 def test_a_mirrored_camera_gives_the_mirrored_light_field(method, how):
     psi, light_field = three_shots(), scene()
     assert psi.colour is not None
-    turned = ImagingMatrix(
+    turned = Psi(
         mirrored(psi.weights, how, (1, 2), (3, 5)),
         mirrored_frames(psi.colour, how),
     )
@@ -92,7 +92,7 @@ def test_a_mirrored_camera_gives_the_mirrored_light_field(method, how):
 @pytest.mark.parametrize("method", ["tv", "adaptive-fast"])
 def test_half_the_light_through_a_psi_of_half_the_weights_changes_nothing(method):
     psi = three_shots()
-    half = ImagingMatrix(psi.weights / 2, psi.colour, psi.binning)
+    half = Psi(psi.weights / 2, psi.colour, psi.binning)
     frames = noisy(psi, scene(), 1).astype(np.float32)
     full, less = (
         reconstruct(method, p, even_frames(f, n)).light_field

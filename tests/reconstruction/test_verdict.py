@@ -19,7 +19,7 @@ from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings, fast
 from emmc_rig.reconstruction.methods import MethodSettings
 from emmc_rig.reconstruction.result import Reconstruction, Status
@@ -171,7 +171,7 @@ def test_what_derivatives_elsewhere_would_show_as_well_is_no_displacement():
 
 
 def test_a_psi_without_its_camera_gives_no_displacement(three):
-    bare = ImagingMatrix(three.weights, three.colour, three.binning)
+    bare = Psi(three.weights, three.colour, three.binning)
     assert displaced(bare, relief_in(bare, grey(bare))).size_px is None
 
 
@@ -762,7 +762,7 @@ def folders(tmp_path_factory):
     simulate_into(right, "non-lambertian", "rgbw-bayer-2shots", camera, SIZE, 0)
     wrong = right.with_name("wrong")
     shutil.copytree(right, wrong)
-    psi = ImagingMatrix.load(wrong / "psi.h5")
+    psi = Psi.load(wrong / "psi.h5")
     dataclasses.replace(psi, weights=np.roll(psi.weights, 6, axis=(3, 5))).save(wrong / "psi.h5")
     return right, wrong
 

@@ -18,7 +18,7 @@ from emmc_rig.model.camera import Camera, camera_of, psi_layout, sensor_response
 from emmc_rig.model.errors import SensingError, ViewOrderWarning
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import check_light_field, save_hdf5
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.model.view_axes import ANGLES
 from emmc_rig.process.captures import opened_capture
 from emmc_rig.process.reconstructing import reconstruct_undrawn
@@ -46,7 +46,7 @@ def psi_of(views, axes, shots=1, closed=False, size=SIZE):
     if closed:
         weights[:, :, ::2] = 0
     weights /= weights.sum(axis=(1, 2)).mean()
-    return ImagingMatrix(weights, np.zeros((shots, *size), np.uint8), view_axes=axes)
+    return Psi(weights, np.zeros((shots, *size), np.uint8), view_axes=axes)
 
 
 def light_of(views, axes, size=SIZE):
@@ -116,7 +116,7 @@ def test_the_names_of_the_view_axes_are_kept_by_files_and_parts_of_psi(tmp_path,
         assert saved.checksum == psi.checksum()
     assert psi.of_shots([1]).view_axes == psi.window(slice(0, 8), slice(0, 8)).view_axes == axes
     assert ", ".join(axes) in repr(psi)
-    again = ImagingMatrix.from_scipy(psi.to_scipy(), (2, 3), SIZE, view_axes=axes)
+    again = Psi.from_scipy(psi.to_scipy(), (2, 3), SIZE, view_axes=axes)
     assert again.view_axes == axes
 
 
@@ -125,7 +125,7 @@ def test_a_psi_of_an_earlier_version_has_its_views_at_angles(tmp_path):
     psi.save(tmp_path / "psi.h5")
     with h5py.File(tmp_path / "psi.h5", "r+") as file:
         del file.attrs["view_axes"]
-    assert ImagingMatrix.load(tmp_path / "psi.h5").view_axes == ANGLES
+    assert Psi.load(tmp_path / "psi.h5").view_axes == ANGLES
     content = b"emmc-rig imaging matrix 1|1|" + psi.weights.tobytes() + psi.colour_map.tobytes()
     assert psi.checksum() == hashlib.sha256(content).hexdigest()
 
@@ -142,7 +142,7 @@ def test_other_view_axes_in_a_file_are_refused(tmp_path, stored, words):
     psi_of((1, 3), BANDS).save(path)
     with h5py.File(path, "r+") as file:
         file.attrs["view_axes"] = stored
-    for opened in (ImagingMatrix.load, lambda path: StoredPsi(path).verify()):
+    for opened in (Psi.load, lambda path: StoredPsi(path).verify()):
         with pytest.raises(SensingError, match=words):
             opened(path)
 
@@ -201,7 +201,7 @@ def described(**view_axes):
     ("make", "words"),
     [
         (
-            lambda: ImagingMatrix(np.ones((1, 1, 2, 4, 3, 4)), None, view_axes=("angle", "colour")),
+            lambda: Psi(np.ones((1, 1, 2, 4, 3, 4)), None, view_axes=("angle", "colour")),
             "view_axes.*'angle', 'band'",
         ),
         (described(view_axes=["angle", "colour"]), "view_axes.1: .*'angle', 'band' or 'time'"),
@@ -420,7 +420,7 @@ def test_psi_says_how_far_bands_lie_apart_behind_a_prism(shift_px, along):
     views = (1, bands) if along else (bands, 1)
     axes = ("angle", "band") if along else ("band", "angle")
     weights = weights.reshape(1, *views, size[0], 1, size[1])
-    psi = ImagingMatrix(weights, np.zeros((1, *size), np.uint8), view_axes=axes)
+    psi = Psi(weights, np.zeros((1, *size), np.uint8), view_axes=axes)
     assert mask_shift_px(psi) == pytest.approx(shift_px, abs=0.02)
     # Codes of their own are no shift.
     assert mask_shift_px(psi_of((1, 5), BANDS, size=size)) is None

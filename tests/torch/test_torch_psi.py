@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import emmc_rig as emmc
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 
 torch = pytest.importorskip("torch", reason="needs the extra `torch`")
 
@@ -19,7 +19,7 @@ def random_psi(shots, stored, binning, size=(4, 6), dtype="f8"):
     rng = np.random.default_rng(0)
     weights = rng.uniform(0, 1, (shots, 2, 3, size[0], stored, size[1])).astype(dtype)
     colour = rng.integers(0, 3, (shots, *size), dtype=np.uint8) if stored == 1 else None
-    return ImagingMatrix(weights, colour, binning)
+    return Psi(weights, colour, binning)
 
 
 def random_arrays(psi, batch=(), seed=1):

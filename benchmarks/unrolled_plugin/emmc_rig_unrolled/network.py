@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812
 
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.problem import smooth_guess
 from emmc_rig.torch import TorchPsi
@@ -71,9 +71,7 @@ def by_view(light_field: Tensor) -> Tensor:
     return light_field.flatten(0, 1).movedim(-1, 1)
 
 
-def captured(
-    psi: ImagingMatrix, frames: Array, variance: Array, usable: NDArray[np.bool_]
-) -> Capture:
+def captured(psi: Psi, frames: Array, variance: Array, usable: NDArray[np.bool_]) -> Capture:
     """Return a capture as the network takes it; arrays as every method gets them."""
     guess = smooth_guess(psi, frames, usable)
     brightness = max(float(guess.mean()), 1e-9)
@@ -178,7 +176,7 @@ class Unrolled(nn.Module):
 
 def estimated(
     weights: NetworkWeights,
-    psi: ImagingMatrix,
+    psi: Psi,
     frames: Array,
     variance: Array,
     usable: NDArray[np.bool_],

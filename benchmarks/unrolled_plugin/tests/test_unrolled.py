@@ -10,7 +10,7 @@ from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.methods import METHODS, MethodSettings, reconstruct
 from emmc_rig.reconstruction.problem import smooth_guess
@@ -33,7 +33,7 @@ def random_psi(shots, views, size, stored=1, binning=1):
     rng = np.random.default_rng(0)
     weights = rng.uniform(0, 1, (shots, *views, size[0], stored, size[1])).astype(np.float32)
     colour = rng.integers(0, 3, (shots, *size), dtype=np.uint8) if stored == 1 else None
-    return ImagingMatrix(weights, colour, binning)
+    return Psi(weights, colour, binning)
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ from scipy.linalg import cho_factor, cho_solve
 from emmc_rig.model.camera import Camera, pixel_light
 from emmc_rig.model.geometry import fresnel_number
 from emmc_rig.model.lightfield import OPPONENT
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.evidence import TexturePrior
 from emmc_rig.reconstruction.errors import ReconstructionError
 
@@ -115,9 +115,7 @@ class Block:
     noise: NDArray[np.float64]
 
     @classmethod
-    def of(
-        cls, psi: ImagingMatrix, variance: Array, corner: tuple[int, int], side: int = SIDE
-    ) -> Block:
+    def of(cls, psi: Psi, variance: Array, corner: tuple[int, int], side: int = SIDE) -> Block:
         """Return the block of side x side samples at a corner (y, x).
 
         variance: of the readings, (shot, y, x). Raises ReconstructionError for larger pixels.
@@ -204,7 +202,7 @@ class Expected:
     fresnel: float
 
 
-def expected(camera: Camera, psi: ImagingMatrix, disparities_px: tuple[float, float]) -> Expected:
+def expected(camera: Camera, psi: Psi, disparities_px: tuple[float, float]) -> Expected:
     """Return what to expect of a camera with this Psi, of SIZE; see `printed.printed_psi`.
 
     Raises ReconstructionError for pixels of several samples.
@@ -216,7 +214,7 @@ def expected(camera: Camera, psi: ImagingMatrix, disparities_px: tuple[float, fl
     return Expected(_psnr_db(errors), psi.light_efficiency(), least_fresnel(camera))
 
 
-def _blocks(camera: Camera, psi: ImagingMatrix) -> list[Block]:
+def _blocks(camera: Camera, psi: Psi) -> list[Block]:
     light = pixel_light(camera, psi.size)
     grey = np.full(psi.light_field_shape, BRIGHTNESS, dtype=np.float32)
     exposures_s = camera.exposures_s()[:, None, None]

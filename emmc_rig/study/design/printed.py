@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, grey_dilation, grey_erosion
 
 from emmc_rig.model.camera import Camera, Plate, build_imaging_matrix, draw_plates
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.simulators.flaws import WAVELENGTHS_UM, diffracted
 
 GRAIN_UM = 2.0
@@ -33,7 +33,7 @@ class Print:
     diffraction: bool = True
 
 
-def printed_psi(camera: Camera, size: tuple[int, int], how: Print) -> ImagingMatrix:
+def printed_psi(camera: Camera, size: tuple[int, int], how: Print) -> Psi:
     """Return Psi of a camera whose masks between sensor and lens came out so.
 
     Raises CameraError as `build_imaging_matrix` does.

@@ -13,14 +13,14 @@ from emmc_rig.calibration.parametric import psi_at, shot_stages
 from emmc_rig.calibration.placement import Placement, designed_placement
 from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import Camera
-from emmc_rig.model.sensing import ImagingMatrix
+from emmc_rig.model.sensing import Psi
 from emmc_rig.simulators.flaws import OpticsFlaws
 from emmc_rig.study.points import NotApplicableError
 from emmc_rig.study.stability.fault import MASK, Fault
 from emmc_rig.study.trial import Capture, Trial, trial_of
 
 
-def misplaced_psi(capture: Capture, placement: Placement) -> ImagingMatrix:
+def misplaced_psi(capture: Capture, placement: Placement) -> Psi:
     """Return Psi of a capture whose mask sits otherwise than designed.
 
     Raises NotApplicableError unless the camera has one mask, between lens and sensor.
