@@ -17,6 +17,7 @@ from emmc_rig.commands.chart import chart
 from emmc_rig.commands.demo import demo
 from emmc_rig.commands.design import design
 from emmc_rig.commands.devices import app as devices
+from emmc_rig.commands.examples import examples_of
 from emmc_rig.commands.export import export
 from emmc_rig.commands.figure import figure
 from emmc_rig.commands.import_ import import_
@@ -40,9 +41,8 @@ UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])
 app = typer.Typer(
     name="emmc-rig",
     help="Compressed light-field acquisition: model, rig, calibration, reconstruction.",
-    no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 GROUPS: dict[str, tuple[typer.Typer | Callable[..., None], ...]] = {
     "Bench": (devices, live, capture, session, calibrate, mask, import_),
@@ -54,28 +54,36 @@ for panel, commands in GROUPS.items():
     for command in commands:
         if isinstance(command, typer.Typer):
             for member in command.registered_commands:
+                name = member.name or getattr(member.callback, "__name__", "")
                 member.cls = ModalCommand
+                member.epilog = examples_of(f"{command.info.name} {name.replace('_', '-')}")
             app.add_typer(command, rich_help_panel=panel)
         else:
             name = command.__name__.rstrip("_")  # `import` is a word of Python's
-            app.command(name, cls=ModalCommand, rich_help_panel=panel)(command)
+            app.command(name, cls=ModalCommand, rich_help_panel=panel, epilog=examples_of(name))(
+                command
+            )
 
 
 @app.callback(invoke_without_command=True)
 def root(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="print the version")] = False,
 ) -> None:
     """Compressed light-field acquisition: model, rig, calibration, reconstruction."""
     if version:
         typer.echo(f"emmc-rig {__version__}")
         raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo("start: emmc-rig demo")
+        typer.echo(context.get_help())
 
 
 def main() -> None:
     """Run the program; an error of `ERRORS` becomes a line without a traceback."""
     try:
         with _warnings_as_notes():
-            code = app(standalone_mode=False) or 0
+            code = app(args=_typed(), prog_name="emmc-rig", standalone_mode=False) or 0
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         sys.exit(code)
@@ -92,6 +100,14 @@ def main() -> None:
     except UsageError as fault:
         fault.show()
         sys.exit(fault.exit_code)
+
+
+def _typed() -> list[str]:
+    """Return the words of the command line; `help COMMAND` is taken as `COMMAND --help`."""
+    words = sys.argv[1:]
+    if words[:1] != ["help"]:
+        return words
+    return [*words[1:], "--help"] if words[1:] else []
 
 
 @contextmanager

@@ -23,16 +23,9 @@ def cameras(
     out: Annotated[Path | None, out_option("camera-NAME")] = None,
 ) -> None:
     """List the shipped cameras, or draw the masks of one."""
-    import emmc_rig as emmc
-    from emmc_rig.report.camera_sheet import (
-        camera_figures,
-        camera_rows,
-        draw_camera,
-    )
-    from emmc_rig.store.folders import result_folder
-    from emmc_rig.store.results import write_metrics
-
     if name is None:
+        from emmc_rig.report.camera_list import camera_rows
+
         shown = camera_rows()
         show_table(
             ("camera", "sensor", "shots", "masks", "sampling", "light"),
@@ -44,6 +37,11 @@ def cameras(
         )  # fmt: skip
         give_result(cameras=[asdict(row) for row in shown])
         return
+    import emmc_rig as emmc
+    from emmc_rig.report.camera_sheet import camera_figures, draw_camera
+    from emmc_rig.store.folders import result_folder
+    from emmc_rig.store.results import write_metrics
+
     camera = emmc.camera(name)
     folder_name = out or Path(f"camera-{Path(name).stem}")
     with result_folder(folder_name, "cameras") as folder, shown_progress("draw"):

@@ -136,6 +136,16 @@ class PsiLayout:
         """(shot, pixel_y, pixel_x)."""
         return self.shots, self.size[0] // self.binning, self.size[1] // self.binning
 
+    @property
+    def light_field_shape(self) -> tuple[int, int, int, int, int]:
+        """(v, u, y, x, c)."""
+        return *self.views, *self.size, 3
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of Psi as a matrix."""
+        return int(np.prod(self.frames_shape)), int(np.prod(self.light_field_shape))
+
 
 @dataclass(frozen=True, eq=False)
 class Psi(PsiLayout):
@@ -211,16 +221,6 @@ class Psi(PsiLayout):
     def weights_shape(self) -> tuple[int, ...]:
         """Shape of the weights."""
         return self.weights.shape
-
-    @property
-    def light_field_shape(self) -> tuple[int, int, int, int, int]:
-        """(v, u, y, x, c)."""
-        return *self.views, *self.size, 3
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of Psi as a matrix."""
-        return int(np.prod(self.frames_shape)), int(np.prod(self.light_field_shape))
 
     @property
     def colour_map(self) -> NDArray[np.uint8]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -22,57 +21,19 @@ from emmc_rig.model.camera import (
     build_imaging_matrix,
     draw_plates,
     sensor_response,
-    shipped_cameras,
 )
 from emmc_rig.model.files import whole_file
 from emmc_rig.model.geometry import centred_grid, fresnel_number, mask_position
 from emmc_rig.model.masks import cfa_tile
 from emmc_rig.model.sensing import Psi
 from emmc_rig.model.view_axes import grid_name, picture_name, place_name, shows_parallax
+from emmc_rig.report.camera_list import sensor_name, square_size
 from emmc_rig.report.drawing import FAINT, INK
 
 SHEET_SAMPLES = 64
-LISTING_SAMPLES = 24
 WEIGHTS_SHOWN = 20
 HALF_CELLS_SHOWN = 8
 BLOCKED, RAY, WARNING = "#2b2f38", "#c2410c", "#b45309"
-
-
-@dataclass(frozen=True)
-class CameraRow:
-    """A camera's line in the listing; `sampling_rate` is a fraction such as "1/25"."""
-
-    name: str
-    title: str
-    sensor: str
-    shots: int
-    masks: int
-    sampling_rate: str
-    light_percent: float
-
-
-def camera_rows() -> list[CameraRow]:
-    """Return the shipped cameras' lines of the listing, by name."""
-    rows = []
-    for name, camera in shipped_cameras().items():
-        psi = build_imaging_matrix(camera, _square(camera, LISTING_SAMPLES))
-        sampling_rate, light_percent = str(Fraction(*psi.shape)), 100 * psi.light_efficiency()
-        names = name, camera.title, _sensor_name(camera)
-        rows.append(CameraRow(*names, psi.shots, len(camera.masks), sampling_rate, light_percent))
-    return rows
-
-
-def _square(camera: Camera, samples: int) -> tuple[int, int]:
-    """Return a square size near `samples` that the camera's pixels divide."""
-    side = max(samples // camera.sensor.binning, 1) * camera.sensor.binning
-    return side, side
-
-
-def _sensor_name(camera: Camera) -> str:
-    cfa = camera.sensor.cfa
-    name = cfa if isinstance(cfa, str) else "/".join(cfa)
-    k = camera.sensor.binning
-    return name if k == 1 else f"{name}, {k} x {k} binned"
 
 
 def camera_figures(camera: Camera, size: tuple[int, int] = (64, 64)) -> dict[str, Any]:
@@ -115,7 +76,7 @@ def draw_camera(camera: Camera, path: Path) -> None:
 
     Raises CameraError when the camera cannot be built, AppError when the file cannot be written.
     """
-    size = _square(camera, SHEET_SAMPLES)
+    size = square_size(camera, SHEET_SAMPLES)
     psi = build_imaging_matrix(camera, size)
     masked = bool(camera.shot_masks(0))
     heights = [0.6, 2.8, *([3.6] if masked else []), 3.5]
@@ -170,7 +131,7 @@ def _write_figures(axes: Axes, camera: Camera, psi: Psi) -> None:
     width = f"{open_mm:g} mm wide" if open_mm else "points"
     exposure_ms = 1e3 * float(camera.exposures_s().sum())
     lines = [
-        ("sensor", f"{_sensor_name(camera)}, {camera.sensor.sample_pitch_um:g} um per sample"),
+        ("sensor", f"{sensor_name(camera)}, {camera.sensor.sample_pitch_um:g} um per sample"),
         ("views", f"{grid_name(camera.view_axes, camera.views)}, "
          f"{lens.aperture_cell_mm:g} mm apart, {width}"),
         ("shots", f"{len(camera.shots)}, {exposure_ms:.3g} ms in all"),
@@ -251,7 +212,7 @@ def _draw_weights(band: SubFigure, camera: Camera, psi: Psi) -> None:
     tile = cfa_tile(camera.sensor.cfa)
     filters = np.tile(tile, (8 // len(tile) + 1, 8 // len(tile[0]) + 1, 1))[:8, :8]
     panels = [
-        (f"colour filters: {_sensor_name(camera)}", "pixel", filters),
+        (f"colour filters: {sensor_name(camera)}", "pixel", filters),
         (f"centre {name}: {place_name(*place, middle)}", "sample", _crop(passed[middle])),
         (f"first {name}: {place_name(*place, corner)}", "sample", _crop(passed[corner])),
         (f"all {name}s (a whiteboard); full scale {peak:.2f}", "sample", _crop(whiteboard) / peak),

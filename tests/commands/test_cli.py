@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from programs import PROGRAM, done, refused
 from view_files import save_views
 
 from emmc_rig import cli
+from emmc_rig.commands.examples import EXAMPLES
 from emmc_rig.version import __version__
 
 SMALL = ["--size", "24x32"]
@@ -69,6 +71,48 @@ def test_version_and_help_are_printed(run):
     assert panels == ["Options", "Bench", "Results", "Studies"]
     listed = re.findall(r"^│ ([a-z]+) ", out, re.MULTILINE)
     assert sorted(listed) == sorted(COMMANDS)
+
+
+@pytest.mark.parametrize("typed", [(), ("help",)])
+def test_who_types_no_command_learns_where_to_start(run, typed):
+    out = done(run(*typed))
+    assert out.startswith("start: emmc-rig demo\n")
+    assert "Usage: emmc-rig [OPTIONS] COMMAND" in out
+
+
+def test_help_is_asked_for_in_three_ways(run):
+    wanted = done(run("devices", "jog", "--help"))
+    assert wanted == done(run("devices", "jog", "-h")) == done(run("help", "devices", "jog"))
+
+
+def _leaves(command, words=()):
+    """Yield a group's commands, with the words that call them."""
+    for name, member in getattr(command, "commands", {}).items():
+        if getattr(member, "commands", None):
+            yield from _leaves(member, (*words, name))
+        else:
+            yield (*words, name), member
+
+
+def test_each_help_ends_with_two_examples_that_can_be_typed(run):
+    every = dict(_leaves(typer.main.get_command(cli.app)))
+    unused = set(EXAMPLES)
+    for words, command in every.items():
+        mine = [line for line in EXAMPLES if tuple(line.split()[: len(words)]) == words]
+        assert len(mine) == 2, words
+        unused -= set(mine)
+        for line in mine:
+            typed = shlex.split(line.split(" | ")[0])[len(words) :]
+            command.make_context(" ".join(words), typed).close()
+    assert not unused
+    out = done(run("devices", "jog", "-h"))
+    assert out.rstrip().endswith("emmc-rig devices jog x --to 12000 --rig bench.yaml")
+
+
+def test_a_shell_completes_commands():
+    asked = {"_EMMC_RIG_COMPLETE": "complete_bash", "COMP_WORDS": "emmc-rig ca", "COMP_CWORD": "1"}
+    found = subprocess.run(PROGRAM, env=os.environ | asked, capture_output=True, text=True)
+    assert found.stdout.split() == ["capture", "calibrate", "cameras"]
 
 
 @pytest.mark.slow

@@ -12,7 +12,8 @@ from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
-from emmc_rig.report.camera_sheet import camera_figures, camera_rows, draw_camera
+from emmc_rig.report.camera_list import camera_rows
+from emmc_rig.report.camera_sheet import camera_figures, draw_camera
 
 
 def camera(**settings: object) -> Camera:
