@@ -4,12 +4,14 @@ import re
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.frames import even_frames
 from emmc_rig.reconstruction.method import Given
 from emmc_rig.study.trial import Capture
+from emmc_rig.version import __version__
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -57,3 +59,8 @@ def test_every_place_that_the_table_names_exists():
         assert (ROOT / place).exists(), place
     for link in re.findall(r"\]\(([\w/.]+)\)", TEXT):
         assert (ROOT / link).exists(), link
+
+
+def test_the_citation_names_the_program_s_version():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert str(cited["version"]) == __version__
