@@ -126,7 +126,7 @@ def capture_plan(settings: PlanSettings, planned: PlannedFrames) -> Plan:
     return Plan(
         title=f"{settings.camera_name}, to calibrate to {settings.target:.2%}",
         camera=settings.camera_name,
-        shots=tuple(PlannedShot() for _ in settings.camera.shots),
+        shots=tuple(PlannedShot(exposure_s="auto") for _ in settings.camera.shots),
         whiteboards=Boards(
             views="all" if every else tuple(sorted(through)),
             shots=(0,),
@@ -262,6 +262,7 @@ def write_plan(settings: PlanSettings, folder: Path) -> dict:
         ],
         "frames_by_kind": dict(counts),
         "frames": counts.total(),
+        "shots": len(camera.shots),
         "left_out": {name: WATCHES[name] for name in sorted(settings.skip)},
         "expected_relative_error": planned.expected_error,
     }

@@ -118,8 +118,8 @@ def _plan_whiteboards(
     with result_folder(out, "calibrate --plan") as folder, shown_progress("plan"):
         metrics = write_plan(settings, folder)
     tell(
-        f"{metrics['frames']} frames; expected calibration error "
-        f"{metrics['expected_relative_error']:.2%}"
+        f"{metrics['frames']} frames, and {metrics['shots']} of the scene; expected calibration "
+        f"error {metrics['expected_relative_error']:.2%}"
     )
     if wanted := metrics["few_would_take_frames"]:
         tell(f"planned one whiteboard of every view: with --few it would be {wanted} frames")

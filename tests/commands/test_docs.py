@@ -269,6 +269,15 @@ def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
             assert all(ours.get(path) == before[path] or path in grown for path in lost), lost
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("small", "_fitted_once")
+def test_the_tutorial_as_typed_ends_in_trust():
+    page = ROOT / "docs" / "tutorial.md"
+    typed = [words for why, found in blocks(page) if why is None for words in found]
+    said = {words[0]: "".join(program(*words)[1:]) for words in typed}
+    assert re.search(r"^trust: ", said["reconstruct"], re.M), said["reconstruct"]
+
+
 def test_the_page_of_results_its_charts_and_the_readmes_table_are_what_the_command_makes():
     made = runpy.run_path(str(ROOT / "benchmarks" / "results_page.py"))["made"]()
     charts = {path for path in made if path.suffix == ".svg"}
