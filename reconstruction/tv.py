@@ -140,6 +140,10 @@ class Sweeps:
         squared_change, squared_size = self._moved.sum(axis=0)
         return float(np.sqrt(squared_change / max(squared_size, 1e-300)))
 
+    def end(self) -> None:
+        """Give back what further steps need, mostly the dual: four times the light field."""
+        del self._sweep
+
     @property
     def light_field(self) -> NDArray[np.float32]:
         """The estimate so far, (v, u, y, x, c) in [0, 1], a copy."""
@@ -156,6 +160,7 @@ def few_steps(
     """
     sweeps = Sweeps.usual(psi, frames, usable, mu)
     sweeps.advance(count)
+    sweeps.end()
     return sweeps.light_field
 
 
@@ -199,6 +204,7 @@ def reconstruct_tv(
             history.append((step, value))
         if on_step is not None:
             on_step(Progress(step, change, value))
+    sweeps.end()
     converged = change <= rtol
     return Reconstruction(
         method=method_name(settings.order, patch_term is not None),
