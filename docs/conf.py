@@ -1,5 +1,6 @@
 """Sphinx: the pages of docs/, the reference from docstrings, examples whose pictures it makes."""
 
+import re
 from pathlib import Path
 
 import typer
@@ -51,6 +52,7 @@ def write_command_line(_: object) -> None:
     command = typer.main.get_command(command_line)
     context = typer.Context(command, info_name="emmc-rig")
     text = get_docs_for_click(obj=command, ctx=context, name="emmc-rig", title="Every option")
+    text = re.sub("^  (emmc-rig .*)$", r"    \1", text, flags=re.M)  # examples, as code
     Path(__file__).with_name("command-line.md").write_text(text, encoding="utf-8")
 
 
