@@ -30,6 +30,7 @@ from scipy.linalg import get_lapack_funcs
 from emmc_rig.model.settings import Settings
 from emmc_rig.reconstruction import bpdn_kernels as kernels
 from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.patches import grouped
 
 Array = NDArray[np.floating]
 Array32 = NDArray[np.float32]
@@ -181,8 +182,8 @@ class SensedDictionary:
     @cached_property
     def rho(self) -> float:
         """ADMM's weight of the splitting, by the median eta of the patches."""
-        eta = float(np.median([self.penalty(patch) for patch in self.data]))
-        return eta / (self.settings.threshold * self.typical_data / self.typical_norm)
+        eta = np.array([self.penalty(patch) for patch in self.data])
+        return _splitting_weight(self.settings, eta, self.typical_data, self.typical_norm)
 
     @cached_property
     def curvature(self) -> float:
@@ -237,6 +238,13 @@ def _penalty(
     return least * typical_norm
 
 
+def _splitting_weight(
+    settings: BPDNSettings, eta: Array, typical_data: float, typical_norm: float
+) -> float:
+    """Return rho of ADMM, by the median eta of some patches."""
+    return float(np.median(eta)) / (settings.threshold * typical_data / typical_norm)
+
+
 def codes(
     atoms: Array32,
     data: Array32,
@@ -252,9 +260,8 @@ def codes(
     found: list[Code | Begun | None] = [None] * len(data)
     if settings.method == "admm" and len(data) >= FEWEST_TOGETHER:
         found = _coded_together(atoms, data, usable, noise_sigma, settings)
-    alike, which = np.unique(usable, axis=0, return_inverse=True)
-    for number, seen in enumerate(alike):
-        patches, sensed = np.flatnonzero(which.ravel() == number), None
+    for patches in grouped(seen.tobytes() for seen in usable).values():
+        seen, sensed = usable[patches[0]], None
         for patch in patches if seen.any() else ():
             begun = found[patch]
             if isinstance(begun, Code):
@@ -293,8 +300,8 @@ def _coded_together(
     if not active.size:
         return found
     eta = _penalty(settings, noise_sigma, len(atoms), norms, size)
-    typical = np.sqrt(np.mean(np.square(size[active]))) / np.median(norms[active])
-    rho = float(np.median(eta[active]) / (settings.threshold * typical))
+    typical_data = float(np.sqrt(np.mean(np.square(size[active]))))
+    rho = _splitting_weight(settings, eta[active], typical_data, float(np.median(norms[active])))
     inverse = ridge_inverse(atoms, rho)
     hidden, rest = _hidden(inverse, usable)
     eta32 = eta.astype(np.float32)

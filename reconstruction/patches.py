@@ -6,6 +6,7 @@ pixel sums k x k samples, corners and sizes are multiples of k, so that no pixel
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,14 @@ def regular_grid(
     ]
     corners = np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, 2)
     return PatchGrid(corners.astype(np.int64), patch)
+
+
+def grouped(keys: Iterable[bytes]) -> dict[bytes, list[int]]:
+    """Return the places of equal keys, by key, in order of the first."""
+    groups: dict[bytes, list[int]] = {}
+    for place, key in enumerate(keys):
+        groups.setdefault(key, []).append(place)
+    return groups
 
 
 def padded(length: int) -> int:

@@ -13,7 +13,7 @@ per atom, `ista`, `fista` and `sl0` 4 n m per step; putting the patch together 2
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import ClassVar
@@ -34,6 +34,7 @@ from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.inputs import checked_inputs
 from emmc_rig.reconstruction.patches import (
     PatchSensing,
+    grouped,
     overlap_add,
     regular_grid,
     selected_atoms,
@@ -133,14 +134,6 @@ class _CodedBatch:
     codes: list[bpdn.Code]
 
 
-def _grouped(keys: Iterable[bytes]) -> dict[bytes, list[int]]:
-    """Return the places of equal keys, by key, in order of the first."""
-    groups: dict[bytes, list[int]] = {}
-    for place, key in enumerate(keys):
-        groups.setdefault(key, []).append(place)
-    return groups
-
-
 class _Coder:
     """Codes the patches of a grid, a batch at a time, in as many threads as numba uses."""
 
@@ -172,7 +165,7 @@ class _Coder:
             yield None, np.arange(len(self.grid))
             return
         seen = (self._cut(colour, corner).tobytes() for corner in self.grid.corners)
-        for key, members in _grouped(seen).items():
+        for key, members in grouped(seen).items():
             colours = np.frombuffer(key, dtype=np.uint8).reshape(self.psi.shots, -1)
             yield colours, np.array(members)
 
@@ -184,7 +177,7 @@ class _Coder:
             weights = self.psi.weights[:, :, :, y : y + rows, :, x : x + columns]
             return hashlib.blake2b(np.ascontiguousarray(weights).data, digest_size=16).digest()
 
-        groups = _grouped(key(corner) for corner in self.grid.corners[patches]).values()
+        groups = grouped(key(corner) for corner in self.grid.corners[patches]).values()
         self.classes += len(groups)
         return [
             patches[places[first : first + MOST_TOGETHER]]
@@ -200,7 +193,7 @@ class _Coder:
                 sets = [selected_atoms(self.atoms, None, self.psi.binning)]
                 set_of_shot = [0] * self.psi.shots
             else:
-                shots = list(_grouped(of_shot.tobytes() for of_shot in colours).values())
+                shots = list(grouped(of_shot.tobytes() for of_shot in colours).values())
                 sets = [
                     selected_atoms(self.atoms, colours[alike[0]], self.psi.binning)
                     for alike in shots

@@ -39,11 +39,9 @@ def camera_rows() -> list[CameraRow]:
         layout = psi_layout(camera, size)
         seen = seen_of_white(camera, size, draw_plates(camera, size))
         light_percent = 100 * float(seen.sum() / np.prod(layout.frames_shape))
-        names, counts = (
-            (name, camera.title, sensor_name(camera)),
-            (layout.shots, len(camera.masks)),
-        )
-        rows.append(CameraRow(*names, *counts, str(Fraction(*layout.shape)), light_percent))
+        masks, rate = len(camera.masks), str(Fraction(*layout.shape))
+        sensor = sensor_name(camera)
+        rows.append(CameraRow(name, camera.title, sensor, layout.shots, masks, rate, light_percent))
     return rows
 
 

@@ -112,9 +112,9 @@ def dark_edges(
             widths[number] += 1
     if any(widths):
         # Rectified light fields end so at several sides, at some along a part of their length.
-        for number in able:
+        for number in (number for number in able if not widths[number]):
             first, *within = (dark_share(number, line) for line in range(1 + BESIDE))
-            if not widths[number] and first - max(within) >= PART:
+            if first - max(within) >= PART:
                 widths[number] = 1
     top, bottom, left, right = widths
     within = np.ones((rows, columns), dtype=bool)
