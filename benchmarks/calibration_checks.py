@@ -125,7 +125,7 @@ FULL = {
     "session": Size((48, 64), 1024),
     "cost": Size((96, 128), 512),
     "drift": Size((96, 128), 512, scenes=2),
-    "streamed": Size((1000, 2000), 0),
+    "streamed": Size((4000, 6000), 0),
 }
 SEARCH = DriftSettings(blocks=24, coarse_blocks=16, disparity_px=0.5, disparity_steps=3, block_px=4)
 SMALLEST = Size((24, 32), 128, 1, ("shift of 0.5 px",), ("lamp",), "tv", SEARCH, (3, 3))
@@ -493,10 +493,11 @@ def main() -> None:
             rows.append({"check": name, **vars(row), "met": met, "size": pixels})
             print(f"{row.what}: {row.measured:.4g}{'' if met in (None, True) else ', MISSED'}")
     given.out.mkdir(parents=True, exist_ok=True)
-    table = pandas.DataFrame(rows)
+    table = pandas.DataFrame(rows).assign(commit=lab.commit_of_code())
     table.to_csv(given.out / "calibration_checks.csv", index=False)
     asked = table[table.at_most.notna() & (table.at_most > 0)].set_index("what")
     axes = (asked.measured / asked.at_most).plot.barh(xlabel="measured / at most asked", ylabel="")
+    lab.note_run(given.out, "calibration_checks")
     lab.finished(table, axes, "calibration_checks", given)
 
 

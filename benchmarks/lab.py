@@ -6,7 +6,6 @@ import argparse
 import csv
 import datetime
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,6 +17,7 @@ import joblib
 import matplotlib
 import numpy as np
 import pandas as pd
+from measured_code import COMMIT, FITTING, changed_since, commit_of_code
 
 import emmc_rig
 from emmc_rig.formats.scenes import Scene
@@ -29,11 +29,12 @@ GROUP_A = ("dragons", "dice", "fish", "buttercup", "occlusions", "begonia", "ant
 GROUP_B = (
     "messerschmitt", "bikes", "isochart", "general11", "lytro1@by-parallax", "lytro2@by-parallax",
 )  # fmt: skip
+GROUPS = {"A": GROUP_A, "B": GROUP_B, "AB": (*GROUP_A, *GROUP_B)}
 """Real light fields in the folder EMMC_LIGHTFIELDS: tune on A, report on B."""
 SMALLEST, QUICKEST = (32, 40), ("tv",)
 RUNS = "runs.csv"
-"""Of every CSV beside it: when its rows were measured, by which version, commit and command."""
-RUN_COLUMNS = "file", "date", "version", "commit", "command"
+"""Of every CSV beside it: when its rows were measured, by which version and command."""
+RUN_COLUMNS = "file", "date", "version", "command"
 
 
 def arguments(
@@ -49,7 +50,7 @@ def arguments(
     """
     parser = argparse.ArgumentParser(description=sentence)
     parser.add_argument("--scene", action="append", help=f"may repeat; default: {scenes}")
-    parser.add_argument("--group", choices="AB", help="of the real light fields, instead of scenes")
+    parser.add_argument("--group", choices=GROUPS, help="real light fields, instead of scenes")
     parser.add_argument("--camera", default=camera)
     parser.add_argument("--size", default=size, help="rows x columns of the middle, or whole")
     parser.add_argument("--seed", type=int, default=0)
@@ -74,7 +75,7 @@ def parsed(parser: argparse.ArgumentParser, given: Sequence[str] | None = None):
     args.size = None if sides == ["whole"] else tuple(map(int, sides))
     if args.group:
         folder = Path(os.environ["EMMC_LIGHTFIELDS"])
-        args.scenes = [str(folder / name) for name in (GROUP_A if args.group == "A" else GROUP_B)]
+        args.scenes = [str(folder / name) for name in GROUPS[args.group]]
     args.scenes = tuple(args.scene or args.scenes)
     if args.smallest:
         args.size, args.scenes = SMALLEST, args.scenes[:1]
@@ -89,31 +90,35 @@ def points(args, choices: Iterable[Mapping]) -> list[dict]:
 
 
 def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, args) -> pd.DataFrame:
-    """Return a row for each point: the point's values and those of `measure(**point)`.
+    """Return a row for each point: the point's values, those of `measure(**point)`, the commit.
 
-    NAME.csv keeps each finished row, and a later run skips it: delete the file after a change of
-    the program. The run's command and date go into RUNS.
+    NAME.csv keeps each finished row. A later run skips a row if the code that it depends on is
+    still the same, and measures it again otherwise. The run's command and date go into RUNS.
     """
     points = list(points)
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{name}.csv"
     kept = pd.read_csv(path, dtype=str) if path.is_file() else pd.DataFrame()
-    keys = list(points[0])
-    known: set[tuple[str, ...]] = set()
-    if set(keys) <= set(kept.columns):
-        known = set(kept[keys].fillna("").itertuples(index=False, name=None))
+    keys, commit = list(points[0]), commit_of_code(FITTING)
+    wanted = {tuple(map(_text, point.values())) for point in points}
+    if not {*keys, COMMIT} <= set(kept.columns):
+        kept = pd.DataFrame(columns=[*keys, COMMIT])
+    same = [of == commit or not changed_since(of) for of in kept[COMMIT].fillna("")]
+    stays = [s or key not in wanted for s, key in zip(same, _keys(kept, keys), strict=True)]
+    kept = kept[np.array(stays, dtype=bool)]
+    known = set(_keys(kept, keys))
     missing = [point for point in points if tuple(map(_text, point.values())) not in known]
     rows = joblib.Parallel(n_jobs=args.jobs, return_as="generator")(
         joblib.delayed(_row)(measure, point) for point in missing
     )
     for done, row in enumerate(rows, 1):
-        kept = pd.concat([kept, pd.DataFrame([{k: _text(v) for k, v in row.items()}])])
+        row = {key: _text(value) for key, value in row.items()} | {COMMIT: commit}
+        kept = pd.concat([kept, pd.DataFrame([row])])
         kept.to_csv(path, index=False)
         print(f"{done}/{len(missing)}", row, file=sys.stderr)
     if missing:
         note_run(args.out, name)
-    wanted = {tuple(map(_text, point.values())) for point in points}
-    chosen = kept[[key in wanted for key in kept[keys].fillna("").itertuples(False, None)]]
+    chosen = kept[[key in wanted for key in _keys(kept, keys)]]
     return chosen.reset_index(drop=True).apply(_numbers)
 
 
@@ -131,20 +136,22 @@ def part_of(scene: Scene, corner: Sequence[int], size: tuple[int, int]) -> Scene
     return replace(scene, light_field=part, disparity_px=None)
 
 
-def note_run(folder: Path, name: str) -> None:
-    """Write into RUNS when, and by which command, NAME.csv of the folder was measured."""
+def note_run(folder: Path, name: str, command: str | None = None) -> None:
+    """Write into RUNS when, and by which command, NAME.csv of the folder was measured.
+
+    command: this script as it was typed, if None.
+    """
     path = folder / RUNS
     known: dict[str, dict[str, str]] = {}
     if path.is_file():
         with path.open(newline="", encoding="utf-8") as opened:
             known = {row["file"]: row for row in csv.DictReader(opened)}
-    words = [_text(word) for word in sys.argv[1:]]
+    typed = ["python", f"benchmarks/{Path(sys.argv[0]).name}", *map(_text, sys.argv[1:])]
     known[f"{name}.csv"] = {
         "file": f"{name}.csv",
         "date": datetime.date.today().isoformat(),
         "version": emmc_rig.__version__,
-        "commit": _commit(),
-        "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words]),
+        "command": command or " ".join(typed),
     }
     with path.open("w", newline="", encoding="utf-8") as opened:
         writer = csv.DictWriter(opened, RUN_COLUMNS, lineterminator="\n", restval="")
@@ -152,12 +159,8 @@ def note_run(folder: Path, name: str) -> None:
         writer.writerows(known[file] for file in sorted(known))
 
 
-def _commit() -> str:
-    """Return the commit of the code, with a + where files differ from it; "" without git."""
-    asked = ["git", "describe", "--always", "--exclude=*", "--dirty=+"]
-    folder = Path(__file__).parent
-    found = subprocess.run(asked, cwd=folder, capture_output=True, text=True, check=False)
-    return found.stdout.strip()
+def _keys(rows: pd.DataFrame, keys: Sequence[str]) -> list[tuple[str, ...]]:
+    return list(rows[keys].fillna("").itertuples(index=False, name=None))
 
 
 def _row(measure: Callable[..., dict], point: dict) -> dict:

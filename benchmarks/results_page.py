@@ -3,25 +3,28 @@
     python benchmarks/results_page.py
 
 Every figure of the page is a row of a CSV, or a mean of rows; docs/results/runs.csv says when and
-by which command each was measured. The standard library is all that it needs.
+by which command each was measured. Rows whose code has changed since are refused: `--draft` writes
+the page for a look. The standard library and git are all that it needs.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
 import itertools
 import re
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import log
 from pathlib import Path
-from statistics import mean, median
+from statistics import linear_regression, mean, median
 from typing import Any
 
 import svg_charts
+from measured_code import COMMIT, RESULTS, ROOT, stale
 
-ROOT = Path(__file__).parent.parent
-RESULTS = ROOT / "docs" / "results"
 GROUP_A = {"antinous", "begonia", "buttercup", "dice", "dragons", "fish", "occlusions"}
 BEGIN, END = "<!-- reached: python benchmarks/results_page.py -->", "<!-- /reached -->"
 """Around the README's table."""
@@ -98,9 +101,8 @@ def share(rows: Sequence[Row], counts: Callable[[Row], bool]) -> str:
 
 def whole_frames() -> Section:
     """One shot of whole real light fields."""
-    files = "full-frames-adaptive", "full-frames-tv-dict"
-    rows = [row for file in files for row in rows_of(file)]
-    own = {row["scene"]: row for row in rows if row["method"] == "adaptive"}
+    rows = rows_of("full-frames")
+    own = {row["scene"]: row for row in where(rows, method="adaptive")}
     psnr_db = figures(rows, "psnr_db", "scene", "method")
     scenes = sorted(own, key=lambda scene: -psnr_db[scene, "adaptive"])
     methods = "tv-dict", "adaptive"
@@ -124,7 +126,7 @@ def whole_frames() -> Section:
         "above `tv-dict` on average, with noise and without training data.",
         "Right is better; 6 dB halve the error. The grey bar of a light field spans from the "
         "baseline, without parallax, to the best method. Seconds are those of `adaptive`.",
-        files,
+        ("full-frames",),
         {"whole-frames": svg_charts.dots(answer, "PSNR, dB", scenes, dots)},
         table,
         (
@@ -178,13 +180,14 @@ def speed() -> Section:
 
 def whole_speed() -> Section:
     """Accuracy and processor time of whole frames, and what bounds the accuracy."""
-    rows = rows_of("chart-full-frames")
-    means: dict[str, dict[str, tuple[float, float]]] = {}
-    for method, level in dict.fromkeys((row["method"], row["level"]) for row in rows):
-        of = cost_and_psnr(where(rows, method=method, level=level))
-        means.setdefault(method, {})[level] = of
+    rows = rows_of("full-frames")
+    means = {
+        method: {"": (average(of, "cpu_s"), average(of, "psnr_db"))}
+        for method in dict.fromkeys(row["method"] for row in rows)
+        for of in [where(rows, method=method)]
+    }
     scenes = {row["scene"] for row in rows}
-    best, fast = means["adaptive"]["default"], means["adaptive-fast"]["default"]
+    best, fast = means["adaptive"][""], means["adaptive-fast"][""]
     known: dict[str, list[float]] = defaultdict(list)
     for row in rows_of("bounds"):
         known[row["known"]].append(number(row, "psnr_db"))
@@ -195,10 +198,9 @@ def whole_speed() -> Section:
         f"`adaptive` reaches {best[1]:.1f} dB in {best[0]:.0f} s of processor time, "
         f"`adaptive-fast` {fast[1]:.1f} dB in {fast[0]:.0f} s: means of {len(scenes)} whole light "
         "fields. The colours that the filters do not sample limit the PSNR, hardly the disparity.",
-        "Up is better, left is faster. Points of one colour are settings of one method. More "
-        "patches, `best`, cost time without gain in whole frames. The table lists the PSNR with "
-        "parts of the true light field given to the method.",
-        ("chart-full-frames", "bounds"),
+        "Up is better, left is faster. The table lists the PSNR with parts of the true light field "
+        "given to the method.",
+        ("full-frames", "bounds"),
         {
             "whole-speed": svg_charts.points(
                 f"Whole frames: means of {len(scenes)} light fields",
@@ -207,6 +209,109 @@ def whole_speed() -> Section:
         },
         table,
     )  # fmt: skip
+
+
+def shots() -> Section:
+    """One, three and six shots of a moved mask."""
+    rows = [row for row in rows_of("shots") if row["psnr_db"]]
+    counts = sorted({row["shots"] for row in rows}, key=int)
+    methods = sorted(
+        {row["method"] for row in rows},
+        key=lambda method: -average(where(rows, method=method), "psnr_db"),
+    )
+    named: dict[str, dict[str, tuple[float, float]]] = {}
+    table: list[tuple[str, ...]] = [("method", *(f"shots: {count}" for count in counts))]
+    for method in methods:
+        of = {count: where(rows, method=method, shots=count) for count in counts}
+        at = {
+            count: (average(some, "cpu_s"), average(some, "psnr_db")) for count, some in of.items()
+        }
+        named[method] = {f"shots: {count}": point for count, point in at.items()}
+        table.append((f"`{method}`", *(f"{db:.2f} dB, {cpu_s:.0f} s" for cpu_s, db in at.values())))
+    by = figures(rows, "psnr_db", "scene", "method", "shots")
+    scenes = sorted({row["scene"] for row in rows})
+    over = [by[scene, "adaptive", "3"] - by[scene, "tv-dict", "3"] for scene in scenes]
+    first, last = (named["adaptive"][f"shots: {count}"][1] for count in (counts[0], counts[-1]))
+    return Section(
+        "What do more shots give?",
+        f"With the mask moved between {counts[-1]} shots `adaptive` gains {last - first:.1f} dB "
+        f"over one shot; with three it leads `tv-dict` by {min(over):.1f} to {max(over):.1f} dB.",
+        f"Up is better, left is faster. Each point is the mean of {len(scenes)} light fields, "
+        "cropped to 256x256.",
+        ("shots",),
+        {"more-shots": svg_charts.points(
+            f"{counts[-1]} shots gain {last - first:.1f} dB", ("processor seconds", "PSNR, dB"),
+            named,
+        )},
+        table,
+    )  # fmt: skip
+
+
+def growth() -> Section:
+    """Time and memory against the size of the problem."""
+    rows = rows_of("growth")
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    axes = {
+        "pixels": lambda row: samples(row["size"]),
+        "views": lambda row: number(row, "views") ** 2,
+        "shots": lambda row: number(row, "shots"),
+        "disparity range": lambda row: number(row, "zoom"),
+    }
+    table: list[tuple[str, ...]] = [("grows with", *(f"`{method}`" for method in methods))]
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for axis, size_of in axes.items():
+        cells = []
+        for method in methods:
+            at = sorted(
+                (size_of(row), number(row, "cpu_seconds"))
+                for row in where(rows, axis=axis, method=method)
+            )
+            cells.append(f"{slope(at):.2f}")
+            if axis == "pixels":
+                lines[method] = at
+        table.append((axis, *cells))
+    peak = max(number(row, "peak_mib") for row in where(rows, axis="pixels", method="adaptive"))
+    return Section(
+        "How does the time grow?",
+        f"The time of `adaptive` grows with the power {table[1][1 + methods.index('adaptive')]} of "
+        f"the pixels; the largest crop takes {peak / 1024:.1f} GiB.",
+        "The table lists exponents: 1 doubles the time where the quantity doubles, 0 does not "
+        "change it. Lower is better in the chart.",
+        ("growth",),
+        {
+            "growth": svg_charts.lines(
+                "Processor time against pixels", ("pixels of a view", "processor seconds"),
+                lines, log=True,
+            )
+        },
+        table,
+    )  # fmt: skip
+
+
+def slope(line: Sequence[tuple[float, float]]) -> float:
+    """Return the exponent of a power law through points (x, y), by least squares of logarithms."""
+    return linear_regression(*zip(*((log(x), log(y)) for x, y in line), strict=True)).slope
+
+
+def peer() -> Section:
+    """A camera of others with 8x8 views, which a network of theirs reconstructs."""
+    rows = {row["method"]: row for row in rows_of("coded-aperture")}
+    own = rows["adaptive"]
+    table = [("method", "PSNR", "processor time", "verdict")]
+    for method, row in sorted(rows.items(), key=lambda pair: -number(pair[1], "psnr_db")):
+        figures = f"{number(row, 'psnr_db'):.2f} dB", f"{number(row, 'cpu_s'):.0f} s"
+        table.append((f"`{method}`", *figures, row["verdict"]))
+    table.append(("Coded-E2LF, a network trained for it (from its authors)", "27.24 dB", "4 s", ""))
+    return Section(
+        "How do others with more views compare?",
+        f"Behind three coded apertures with 8x8 grey views, `adaptive` reaches "
+        f"{number(own, 'psnr_db'):.1f} dB in {number(own, 'cpu_s'):.0f} s, without training.",
+        "256x256 samples of Lego Knights (Stanford archive); the true middle view in all places "
+        f"has {number(own, 'baseline_db'):.1f} dB.",
+        ("coded-aperture",),
+        {},
+        table,
+    )
 
 
 def films() -> Section:
@@ -285,28 +390,11 @@ def moving_shots() -> Section:
     )
 
 
-def three_shots() -> Section:
-    """Three shots of a moved mask."""
-    rows = rows_of("three-shots")
-    by = figures(rows, "psnr_db", "scene", "method")
-    scenes = sorted({row["scene"] for row in rows}, key=lambda scene: -by[scene, "adaptive"])
-    dots = {method: [by[scene, method] for scene in scenes] for method in ("tv-dict", "adaptive")}
-    over = leads(dots, "adaptive", "tv-dict")
-    answer = f"Three shots: adaptive is {mean(over):.1f} dB above tv-dict"
-    return Section(
-        "What do three shots give?",
-        f"With the mask moved between three shots `adaptive` leads `tv-dict` by "
-        f"{min(over):.1f} to {max(over):.1f} dB.",
-        f"Right is better. {len(scenes)} light fields, cropped to 256x256; the last ones have "
-        "disparities beyond the search range.",
-        ("three-shots",),
-        {"three-shots": svg_charts.dots(answer, "PSNR, dB", scenes, dots)},
-    )
-
-
 def noise_and_shots() -> Section:
     """Whether a better capture is ever a worse result."""
-    rows = rows_of("noise-and-shots")
+    rows = [row for row in rows_of("noise-and-shots") if row["psnr_db"]]
+    least = min((row["shots"] for row in rows), key=int)
+    middle = next(row["noise"] for row in rows if row["shots"] != least)
 
     def curves(key: str, kept: Callable[[Row], bool]) -> list[list[tuple[float, float]]]:
         by: dict[str, list[tuple[float, float]]] = defaultdict(list)
@@ -318,8 +406,8 @@ def noise_and_shots() -> Section:
     def averaged(every: list[list[tuple[float, float]]]) -> list[tuple[float, float]]:
         return [(column[0][0], mean(db for _, db in column)) for column in zip(*every, strict=True)]
 
-    noise = curves("noise_sigma", lambda row: row["shots"] == "1")
-    shots = curves("shots", lambda row: row["noise_sigma"] == "0.004")
+    noise = curves("noise", lambda row: row["shots"] == least)
+    shots = curves("shots", lambda row: row["noise"] == middle)
     gained, more = (abs(line[-1][1] - line[0][1]) for line in (averaged(noise), averaged(shots)))
     falls = max(high - low for line in shots for (_, high), (_, low) in itertools.pairwise(line))
     charts = {
@@ -472,22 +560,20 @@ def verdicts() -> Section:
 
 def wrong_psi() -> Section:
     """What a moved mask costs, and what fitting Psi to the frames wins back."""
-    rows = where(rows_of("mismatch"), error="Mask shift 0.5 px")
-    # It has become part of `adaptive`.
-    rows = [row for row in rows if row["method"] != "adaptive-dict"]
-    rows.sort(key=lambda row: -number(row, "oracle"))
+    rows = where(rows_of("mismatch"), error="mask-shift")
+    rows.sort(key=lambda row: -number(row, "oracle_db"))
     names = {
-        "Psi before the shift": "mismatched", "Psi fitted to the frames": "blind",
-        "the true Psi": "oracle",
+        "Psi before the shift": "assumed_db", "Psi fitted to the frames": "mended_db",
+        "the true Psi": "oracle_db",
     }  # fmt: skip
     dots = {words: [number(row, key) for row in rows] for words, key in names.items()}
     lost = leads(dots, "the true Psi", "Psi before the shift")
-    won = min(number(row, "recovered_of_oracle") for row in rows)
+    won = leads(dots, "Psi fitted to the frames", "Psi before the shift")
     answer = "A mask shifted by half a pixel costs every method; the frames correct Psi"
     return Section(
         "What if the mask has moved?",
         f"A shift by half a pixel costs {min(lost):.1f} to {max(lost):.1f} dB; fitting Psi to the "
-        f"frames alone recovers {percent(won)} or more of this loss.",
+        f"frames alone recovers {percent(sum(won) / sum(lost))} of this loss.",
         "The grey bar is the loss by the wrong Psi. One scene, 32x40: the order counts, not the "
         "absolute values.",
         ("mismatch",),
@@ -580,18 +666,17 @@ def calibration() -> Section:
         ("both combined", "Psi, combined"),
     ):
         table.append((words, f"{100 * by[what]:.2f} %"))
-    sizes = rows_of("calibration-sizes")
-    largest = max(sizes, key=lambda row: number(row, "columns"))
     return Section(
         "How well is Psi measured?",
         f"The error of Psi is {100 * by['Psi, combined']:.1f} %, from {by['frames']:.0f} frames of "
         "a simulated bench with offset, rotation, dust, vignetting and bad pixels, and agrees with "
         "the stated deviation. "
-        f"{largest['rows']}x{largest['columns']} pixels take {largest['cpu_s']} s and "
-        f"{largest['peak_gib']} GiB.",
+        f"A sensor of {next(row['size'] for row in rows if row['check'] == 'streamed')} pixels "
+        f"takes {by['streamed: CPU time, s']:.0f} s and "
+        f"{by['streamed: peak memory, GiB']:.2f} GiB.",
         "Each row is a bench with another fault. The stated and the true error of a row should "
         "coincide; the true Psi is integrated ray by ray.",
-        ("calibration_checks", "calibration-sizes"),
+        ("calibration_checks",),
         {
             "calibration": svg_charts.dots(
                 "The stated error of Psi matches the true error", "error of Psi, %", labels, dots, 0
@@ -634,8 +719,7 @@ def mask_design() -> Section:
 
 def learning() -> Section:
     """What a trained network gains."""
-    rows = [*rows_of("group-b-chart"), *rows_of("group-b-unrolled")]
-    kept = where(rows, camera="scenario-ii-cfa", level="default")
+    kept = where(rows_of("chart-group-b-64x80"), camera=CAMERAS["one shot"], level="default")
     by = figures(kept, "psnr_db", "scene", "method")
     scenes = sorted({row["scene"] for row in kept}, key=lambda scene: -by[scene, "adaptive"])
     dots = {
@@ -650,9 +734,9 @@ def learning() -> Section:
         "What does training gain?",
         f"A small network, trained on random worlds, gains {over:.1f} dB over total "
         f"variation and stays {under:.1f} dB below `adaptive`, which needs no training data.",
-        "Right is better. Group B, 128x160, one shot. The network is the plug-in "
+        "Right is better. Group B, 64x80, one shot. The network is the plug-in "
         "`benchmarks/unrolled_plugin`.",
-        ("group-b-chart", "group-b-unrolled"),
+        ("chart-group-b-64x80",),
         {
             "learning": svg_charts.dots(
                 "A small network gains little, the adaptive model much", "PSNR, dB", scenes, dots
@@ -708,21 +792,21 @@ def others() -> Section:
 def large() -> Section:
     """Whole sensors."""
     rows = rows_of("large")
-    table = [("megapixels", "method", "processor time", "per sample", "memory per worker")]
+    table = [("megapixels", "method", "time of one worker", "per sample", "memory per worker")]
     for row in rows:
-        samples = number(row, "rows") * number(row, "columns")
-        cpu_s = number(row, "cpu_s") + number(row, "survey_cpu_s")
+        seconds = number(row, "seconds")
         table.append(
             (
-                row["megapixels"], f"`{row['method']}`", f"{cpu_s / 60:.0f} min",
-                f"{1e3 * cpu_s / samples:.2f} ms", f"{row['worker_gib']} GiB",
+                row["megapixels"], f"`{row['method']}`", f"{seconds / 60:.0f} min",
+                f"{1e3 * seconds / samples(row['size']):.2f} ms",
+                f"{number(row, 'peak_gib'):.2f} GiB",
             )
         )  # fmt: skip
     most = max(rows, key=lambda row: number(row, "megapixels"))
     return Section(
         "How large can a light field be?",
         f"{most['megapixels']} megapixels were reconstructed in {most['blocks']} blocks of "
-        f"{most['worker_gib']} GiB each.",
+        f"{number(most, 'peak_gib'):.2f} GiB each.",
         "Time and memory grow with the pixels and the range of disparities; "
         "[large captures](scale.md) explains how to distribute them.",
         ("large",),
@@ -731,9 +815,15 @@ def large() -> Section:
     )
 
 
+def samples(size: str) -> int:
+    """Return the samples of a size such as "64x80" or "(64, 80)"."""
+    rows, columns = map(int, re.findall(r"\d+", size))
+    return rows * columns
+
+
 SECTIONS: tuple[Callable[[], Section], ...] = (
-    whole_frames, whole_speed, speed, films, moving_shots, three_shots, noise_and_shots, stated,
-    verdicts, wrong_psi, breaking, calibration, mask_design, learning, others, large,
+    whole_frames, whole_speed, speed, shots, growth, peer, films, moving_shots, noise_and_shots,
+    stated, verdicts, wrong_psi, breaking, calibration, mask_design, learning, others, large,
 )  # fmt: skip
 
 HEAD = """\
@@ -755,9 +845,10 @@ def table_text(rows: Sequence[Sequence[str]]) -> str:
 
 
 def run_text(file: str, runs: Mapping[str, Row]) -> str:
-    """Return a link to a CSV, with date, version, commit and command of its measurement."""
+    """Return a link to a CSV, with date, version, commits and command of its measurement."""
     run = runs[f"{file}.csv"]
-    commit = f", commit {run['commit']}" if run.get("commit") else ""
+    commits = sorted({row.get(COMMIT) or "" for row in rows_of(file)} - {""})
+    commit = f", commit {', '.join(commits)}" if commits else ""
     return (
         f"[{file}.csv](results/{file}.csv): {run['date']}, version {run['version']}{commit}, "
         f"`{run['command']}`"
@@ -779,13 +870,24 @@ def older_text(files: Sequence[str], runs: Mapping[str, Row]) -> str:
     return f"by version {' and '.join(older)}" if older else ""
 
 
+def sections() -> tuple[list[Section], list[str]]:
+    """Return the sections whose rows have been measured, and the CSVs that others lack."""
+    found, lacking = [], []
+    for make in SECTIONS:
+        try:
+            found.append(make())
+        except FileNotFoundError as error:
+            lacking.append(Path(error.filename).stem)
+    return found, lacking
+
+
 def made() -> dict[Path, str]:
     """Return every file that the command writes, and its text."""
     runs = {row["file"]: row for row in rows_of("runs")}
     files: dict[Path, str] = {}
     page, lines = [HEAD], [("what", "reached", "measured by")]
     shown: set[str] = set()
-    for section in (make() for make in SECTIONS):
+    for section in sections()[0]:
         older = older_text(section.files, runs)
         measured = f" (Measured {older}.)" if older else ""
         page.append(f"## {section.heading}\n\n{section.answer}{measured}\n")
@@ -815,7 +917,15 @@ def made() -> dict[Path, str]:
 
 
 def main() -> None:
-    """Write the page, its charts, and the README's table."""
+    """Write the page, its charts, and the README's table, unless rows are of other code."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--draft", action="store_true", help="write it from rows of other code too")
+    found, lacking = sections()
+    files = dict.fromkeys([*(file for section in found for file in section.files), *lacking])
+    old = [f"{file}.csv: {why}" for file in files if (why := stale(file))]
+    print(*old, sep="\n", file=sys.stderr)
+    if not parser.parse_args().draft and old:
+        sys.exit("nothing written: `python benchmarks/everything.py` measures these again")
     for path, text in made().items():
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, encoding="utf-8")

@@ -20,6 +20,7 @@ OWN = [
 SCRIPTS = [path for path in (*SHARED, *OWN) if path.stem not in ("lab", "test_lab")]
 KEEPING = [*SHARED, LAB / "calibration_checks.py", LAB / "outside_benches.py"]
 """Scripts that write into docs/results unless told otherwise."""
+PEERS_FILES = {"real_captures", "coded_aperture"}
 NEEDS = {"train_network": "torch"}
 """By script, a package beyond the extra `lab`."""
 
@@ -27,8 +28,8 @@ NEEDS = {"train_network": "torch"}
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_a_script_runs_at_its_smallest_size(script, tmp_path, monkeypatch):
-    if script.stem == "real_captures" and "EMMC_PEER_FILES" not in os.environ:
-        pytest.skip("EMMC_PEER_FILES does not name a folder with captures")
+    if script.stem in PEERS_FILES and "EMMC_PEER_FILES" not in os.environ:
+        pytest.skip("EMMC_PEER_FILES names no folder with files of others")
     if script.stem in NEEDS:
         pytest.importorskip(NEEDS[script.stem])
     typed = [str(script), "--smallest", *(("--out", ".") if script in KEEPING else ())]

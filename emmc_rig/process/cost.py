@@ -2,8 +2,8 @@
 
 The seconds of a method are those of the method of factor 1 on a window of the frames, on this
 machine, times the light field's values over the window's, times the factor of the method, see
-`reconstruction.method.Method`. Factors are from the charts docs/results/chart-group-*.csv and
-group-b-chart.csv (64x80 and 128x160 views, one and three shots): there they lie within 0.6 and 1.6
+`reconstruction.method.Method`. Factors are from the charts docs/results/chart-group-*.csv
+(64x80 samples, one and three shots) and from 128x160 samples: there they lie within 0.6 and 1.6
 times these for any scene, camera and size.
 
 The number of workers follows from the memory that a block is estimated to need. What the processes

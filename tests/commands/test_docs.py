@@ -9,6 +9,7 @@ import itertools
 import re
 import runpy
 import shlex
+import tomllib
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -292,3 +293,17 @@ def test_every_csv_of_results_says_when_and_by_which_command_it_was_measured():
         runs = {row["file"]: row for row in csv.DictReader(opened)}
     assert set(runs) == {path.name for path in results.glob("*.csv")} - {"runs.csv"}
     assert all(row["date"] and row["version"] and row["command"] for row in runs.values())
+
+
+def test_the_page_of_dependencies_names_each_package_with_its_licence():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    needed = [
+        *project["dependencies"],
+        *itertools.chain(*project["optional-dependencies"].values()),
+    ]
+    page = (ROOT / "docs" / "dependencies.md").read_text("utf-8")
+    rows = [line.strip("|").split(" | ") for line in page.splitlines() if line.startswith("| ")]
+    rows = [[cell.strip() for cell in row][-3:] for row in rows if row[-1].strip() != "used for"]
+    assert all(licence and use for _, licence, use in rows)
+    named = {name for names, *_ in rows for name in names.split(", ")}
+    assert named == {re.split(r"[>=\[]", words)[0] for words in needed}
