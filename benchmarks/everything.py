@@ -2,9 +2,9 @@
 
     EMMC_LIGHTFIELDS=FOLDER EMMC_PEER_FILES=FOLDER python benchmarks/everything.py
 
-Each run writes a CSV of docs/results, with the commit in each row. A run whose rows are of the code
-as it is now is skipped, so that the same command goes on where it stopped. It takes hours. Commit
-first: rows of changed files have a + after the commit, and the page refuses them. Then
+Each run writes a CSV of docs/results, with the commit in each row. Runs are skipped if their code
+has not changed since: the same command goes on where it stopped. It takes hours. Commit first: rows
+of uncommitted code have a + after the commit, and the page refuses them. Then
 `python benchmarks/results_page.py` writes the page.
 """
 
@@ -42,7 +42,7 @@ LARGE = (("8", "2448x3264", "adaptive-fast"), ("8", "2448x3264", "adaptive"),
 class Run:
     """What makes a CSV: a script of the lab with its arguments, or a function of the name.
 
-    alone: it times, so that nothing else may run beside it.
+    alone: the run measures times; nothing else may run beside it.
     """
 
     name: str
@@ -163,7 +163,7 @@ RUNS = (
 
 
 def main() -> None:
-    """Make the CSVs that are not of this code, those that time first and one at a time."""
+    """Measure what is not of this code; runs that time something have the machine to themselves."""
     parser = argparse.ArgumentParser(description="Measure every figure that the pages state.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="only these; default: all")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)

@@ -139,7 +139,7 @@ def part_of(scene: Scene, corner: Sequence[int], size: tuple[int, int]) -> Scene
 def note_run(folder: Path, name: str, command: str | None = None) -> None:
     """Write into RUNS when, and by which command, NAME.csv of the folder was measured.
 
-    command: this script as it was typed, if None.
+    command: the command line that measured it; by default this script's.
     """
     path = folder / RUNS
     known: dict[str, dict[str, str]] = {}
