@@ -163,7 +163,7 @@ RUNS = (
 
 
 def main() -> None:
-    """Measure what is not of this code; runs that time something have the machine to themselves."""
+    """Carry out the runs whose code has changed since; runs that measure times run alone."""
     parser = argparse.ArgumentParser(description="Measure every figure that the pages state.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="only these; default: all")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
