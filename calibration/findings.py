@@ -36,6 +36,7 @@ from emmc_rig.calibration.planning import PinholeWorth
 from emmc_rig.calibration.shadow import ShadowMask, openings
 from emmc_rig.model.pupil import LEAST_SHARE
 
+Array = NDArray[np.floating]
 LARGEST_FLICKER = 0.01
 """Of a whiteboard's brightness against the others: more is named."""
 LARGEST_MOVE_UM = 1.0
@@ -369,7 +370,7 @@ SHORT = {
 def _lamp_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
     # Against the others: a level that all share is the references' as well.
     size = np.array(cause.size) - np.median(cause.size)
-    large = np.abs(size) > np.maximum(LARGEST_FLICKER, SIGNIFICANT * np.array(cause.deviation))
+    large = np.abs(size) > np.maximum(LARGEST_FLICKER, _by_chance(cause, fit))
     flickering = int(large.sum())
     if not flickering:
         return ""
@@ -381,9 +382,14 @@ def _lamp_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: Shad
     )
 
 
+def _by_chance(cause: FoundCause, fit: Fit) -> Array:
+    """Return how large coefficients of a cause may be by chance, what the fit misses included."""
+    return SIGNIFICANT * max(fit.chi2, 1.0) ** 0.5 * np.array(cause.deviation)
+
+
 def _holes_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
     sizes = np.abs(cause.size)
-    sure = sizes > SIGNIFICANT * np.array(cause.deviation)
+    sure = sizes > _by_chance(cause, fit)
     if cause.width < LEAST_HOLES or not sure.any():
         return ""
     few = [board for board in boards if through_pinhole(board)]

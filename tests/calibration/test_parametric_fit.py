@@ -301,9 +301,10 @@ def test_a_cause_is_named_only_for_whiteboards_where_it_is_far_outside_its_devia
     count = sum(map(through_pinhole, boards)) if name == HOLES else len(boards)
     size = (0.3, 0.1, *[0.0] * (count - 2))
     few = boards if name == LAMP else [board for board in boards if through_pinhole(board)]
-    for second, named in ((0.01, [few[1].name]), (0.03, [])):
+    for second, chi2, named in ((0.01, 1.0, [few[1].name]), (0.03, 1.0, []), (0.01, 9.0, [])):
         cause = FoundCause(name, 0.05, 9.0, (), size, (0.1, second, *[0.01] * (count - 2)))
-        said = [*itertools.chain(*cause_lines(SimpleNamespace(causes=(cause,)), boards, MASK))]
+        fit = SimpleNamespace(causes=(cause,), chi2=chi2)
+        said = [*itertools.chain(*cause_lines(fit, boards, MASK))]
         assert len(said) == len(named)
         assert all(words in line for words, line in zip(named, said, strict=True))
 
