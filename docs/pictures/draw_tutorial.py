@@ -86,7 +86,7 @@ def figures(folder: Path) -> dict[str, Figure]:
     session, counts = Session(plan / "plan-session"), read_metrics(plan)["frames_by_kind"]
     frames = Figure(figsize=(INCH_WIDE, 2.4), layout="constrained")
     axis = frames.add_subplot()
-    kinds = [KINDS.get(kind, kind) for kind in counts]
+    kinds = np.array([KINDS.get(kind, kind) for kind in counts])
     axis.bar_label(axis.barh(kinds, list(counts.values())), padding=3)
     axis.set(xlabel="frames")
     axis.invert_yaxis()

@@ -4,6 +4,7 @@ import itertools
 import re
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -303,7 +304,7 @@ def test_a_cause_is_named_only_for_whiteboards_where_it_is_far_outside_its_devia
     few = boards if name == LAMP else [board for board in boards if through_pinhole(board)]
     for second, chi2, named in ((0.01, 1.0, [few[1].name]), (0.03, 1.0, []), (0.01, 9.0, [])):
         cause = FoundCause(name, 0.05, 9.0, (), size, (0.1, second, *[0.01] * (count - 2)))
-        fit = SimpleNamespace(causes=(cause,), chi2=chi2)
+        fit: Any = SimpleNamespace(causes=(cause,), chi2=chi2)
         said = [*itertools.chain(*cause_lines(fit, boards, MASK))]
         assert len(said) == len(named)
         assert all(words in line for words, line in zip(named, said, strict=True))
