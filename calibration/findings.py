@@ -36,6 +36,7 @@ from emmc_rig.calibration.planning import PinholeWorth
 from emmc_rig.calibration.shadow import ShadowMask, openings
 from emmc_rig.model.pupil import LEAST_SHARE
 
+Array = NDArray[np.floating]
 LARGEST_FLICKER = 0.01
 """Of a whiteboard's brightness against the others: more is named."""
 LARGEST_MOVE_UM = 1.0
@@ -293,14 +294,20 @@ def residual_advice(held: HeldOut) -> str:
     )
 
 
-def fit_advice(fit: Fit) -> list[str]:
-    """Return what the fit says to measure again: too few whiteboards."""
+def fit_advice(fit: Fit, boards: Sequence[Board]) -> list[str]:
+    """Return what the fit says to measure again: too few whiteboards.
+
+    boards: those fitted. Pinholes are asked for where some view has no whiteboard of its own.
+    """
     if not fit.undecided:
         return []
     shown = ", ".join(fit.undecided[:4]) + (" ..." if len(fit.undecided) > 4 else "")
-    more = f"capture {fit.more_boards} more of the same kinds, or a few through a pinhole"
-    if fit.more_boards >= MOST_MORE_BOARDS:
-        more = "capture some through a pinhole"
+    alone = np.any([board.views_open for board in boards if through_pinhole(board)], axis=0)
+    kinds = [
+        *([f"{fit.more_boards} more of the same kinds"] * (fit.more_boards < MOST_MORE_BOARDS)),
+        *([] if alone.all() else ["a few through a pinhole"]),
+    ]
+    more = f"capture {', or '.join(kinds) or 'each with more frames'}"
     return [
         f"too few whiteboards to measure {shown}: Psi takes the value of the camera's file "
         f"instead; {more}"
@@ -363,11 +370,11 @@ SHORT = {
 def _lamp_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
     # Against the others: a level that all share is the references' as well.
     size = np.array(cause.size) - np.median(cause.size)
-    deviation = np.array([check.brightness_deviation for check in fit.boards])
-    flickering = int(np.sum(np.abs(size) > np.maximum(LARGEST_FLICKER, 5 * deviation)))
+    large = np.abs(size) > np.maximum(LARGEST_FLICKER, _by_chance(cause, fit))
+    flickering = int(large.sum())
     if not flickering:
         return ""
-    worst = int(np.argmax(np.abs(size)))
+    worst = int(np.argmax(np.abs(size) * large))
     others = f" ({flickering} of {len(boards)} whiteboards differ)" if flickering > 1 else ""
     return (
         f"{boards[worst].name}: {size[worst]:+.1%} in brightness against the other "
@@ -375,11 +382,18 @@ def _lamp_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: Shad
     )
 
 
+def _by_chance(cause: FoundCause, fit: Fit) -> Array:
+    """Return how large coefficients of a cause may be by chance, what the fit misses included."""
+    return SIGNIFICANT * max(fit.chi2, 1.0) ** 0.5 * np.array(cause.deviation)
+
+
 def _holes_words(cause: FoundCause, fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> str:
-    if cause.width < LEAST_HOLES:
+    sizes = np.abs(cause.size)
+    sure = sizes > _by_chance(cause, fit)
+    if cause.width < LEAST_HOLES or not sure.any():
         return ""
     few = [board for board in boards if through_pinhole(board)]
-    worst = int(np.argmax(np.abs(cause.size)))
+    worst = int(np.argmax(sizes * sure))
     return (
         f"the plate's holes are unequal: their areas differ by {cause.width:.1%}, most that of "
         f"{few[worst].name} ({cause.size[worst]:+.1%}): corrected for"

@@ -396,7 +396,7 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
         fit = fit_placement(readings.seen, task.camera, mask, start=fit)
         glare = _glare(task, plain, mask, fit, readings.seen, glare) or glare
     refusals.refuse_odd_fit(fit, readings.seen, mask)
-    advice, findings = words.fit_advice(fit), words.glare_findings(glare)
+    advice, findings = words.fit_advice(fit, readings.seen), words.glare_findings(glare)
     dusty = moved_dust(Shadow(mask, fit.placement), settled(fit, readings.seen, mask))
     if dusty.any():
         findings.append(words.dust_finding(dusty))

@@ -52,7 +52,7 @@ STEPS = 100
 blocks."""
 SAMPLE, SAMPLES = 96, 3
 """Rows and columns of a sample window of the survey, and windows along each axis."""
-SURE_PX, COVERED = 0.25, 99.0
+SURE_PX, COVERED = 0.3, 99.0
 """The halo covers this percentile of the disparities whose deviation is at most SURE_PX. Fewer
 readings of a block show surfaces beyond; the mean with the neighbouring block helps there."""
 

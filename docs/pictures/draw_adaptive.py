@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 import emmc_rig as emmc
 from emmc_rig.reconstruction.adaptive.fits import averaged, fitted_models
-from emmc_rig.reconstruction.adaptive.search import Volume, variance_per_pixel
+from emmc_rig.reconstruction.adaptive.search import Volume, moments_per_pixel
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.adaptive.survey import checked, surveyed
+from emmc_rig.reconstruction.adaptive.uncertainty import disparity_deviation
 
 SCENE, CAMERA, SIZE = "deep-occlusions", "scenario-ii-cfa", (96, 128)
 MODELS = ("surfaces, looser fit", "surfaces, closer fit", "no surfaces (total variation)")
@@ -75,9 +76,9 @@ def figures(size: tuple[int, int] = SIZE) -> dict[str, Figure]:
     given = checked(psi, frames.of_one_deviation())
     survey = surveyed(given, settings, None, lambda step: None)
     fits = fitted_models(survey, settings, lambda step: None)
-    disparity_sigma = np.sqrt(variance_per_pixel(survey.volume, psi.size, psi.binning))
+    believed = moments_per_pixel(survey.volume, psi.size, psi.binning)
     disparity = fits.scene.centre
-    mean = averaged(survey, fits, disparity_sigma)
+    mean = averaged(survey, fits, np.sqrt(believed.variance))
     assert mean.sigma is not None
     assert scene.disparity_px is not None
 
@@ -89,7 +90,8 @@ def figures(size: tuple[int, int] = SIZE) -> dict[str, Figure]:
 
     depth, (left, right) = _pictures(("disparity found", "how uncertain it is"))
     _map(depth, left, disparity, "pixels per view")
-    _map(depth, right, disparity_sigma, "pixels per view", cmap="magma", vmax=1)
+    unsure = disparity_deviation(disparity, [believed])
+    _map(depth, right, unsure, "pixels per view", cmap="magma", vmax=1)
 
     chosen, axes = _pictures(MODELS)
     for axis, share in zip(axes, mean.shares, strict=True):

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from emmc_rig.bench.hands import AskingAttendant
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.captures.plan import METERING_EXPOSURE_S, Plan
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.stage import needs_approach
 from emmc_rig.session.planned import PlannedFrame
 
@@ -139,8 +140,8 @@ class Estimate:
     """Seconds by kind of work, and bytes on the disk.
 
     by_hand: how often a person is asked to change something at the bench, which takes time of its
-    own. guessed: frames whose exposure is not metered yet. exposing_s: of a film's frames, their
-    periods.
+    own. guessed: frames whose exposure counts and is not metered yet. exposing_s: of a film's
+    frames, their periods.
     """
 
     frames: int
@@ -222,20 +223,21 @@ class Pace:
             guessed += known_s is None
             exposing_s += METERING_EXPOSURE_S * frame.light if known_s is None else known_s
         if not self._waits:
-            moving_s = exposing_s = 0.0
+            moving_s, exposing_s, guessed = 0.0, 0.0, 0
         size = count * (self._bytes + JOURNAL_BYTES_PER_FRAME)
         frame_s = median(self._learnt_s) if self._learnt_s else self.usual_s
         downloading_s = (count - filmed) * frame_s
         return Estimate(count, moving_s, exposing_s, downloading_s, size, by_hand, guessed)
 
 
-def pace_of(rig: Rig, plan: Plan, waits: bool = True) -> Pace:
-    """Return what frames cost on a rig before any is taken."""
+def pace_of(rig: Rig, plan: Plan) -> Pace:
+    """Return what frames cost on a rig before any is taken: no wait by a simulated clock."""
     rows, columns = rig.camera.shape
     speeds_um_s = {axis: rig.stage.speed_um_s(axis) for axis in rig.stage.axes}
     asks = isinstance(rig.attendant, AskingAttendant)
     period_s = 0.0 if plan.film is None else 1 / plan.film.rate
     size = 2 * rows * columns
+    waits = rig.clock is SYSTEM_CLOCK
     return Pace(speeds_um_s, plan.settle_s, size, waits, rig.hands, asks, period_s)
 
 

@@ -29,7 +29,6 @@ from emmc_rig.captures.metering import Exposures
 from emmc_rig.captures.plan import Plan
 from emmc_rig.captures.recorder import Recorder
 from emmc_rig.captures.schedule import pace_of
-from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.errors import DriverError
 from emmc_rig.errors import AppError, StopCapture
 from emmc_rig.model.json_text import one_line
@@ -119,7 +118,7 @@ class Sequencer:
                 session, plan, rig, self._engine, self._recorder, self._control, self._take_frame,
                 self._count_taken,
             )  # fmt: skip
-        self._pace = pace_of(rig, plan, rig.clock is SYSTEM_CLOCK)
+        self._pace = pace_of(rig, plan)
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
         self._budget = Budget(plan.retries)
         # The latest choice of frames, and the rest of this choice that is still to be taken.

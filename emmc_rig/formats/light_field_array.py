@@ -26,17 +26,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.floating]
 UNITS = {"sigma": "1", "disparity": "pixel per view", "disparity_sigma": "pixel per view"}
 """Of the maps that are passed on."""
-SEARCH_MISSES = 1.5
-"""By how much disparity is missed, over what its search states. Of 36 captures of group A and of
-built-in scenes (`benchmarks/depth.py`) 94 % of the depths (median) are within two deviations;
-without the factor 85 %, with 2 97 %."""
 
 
 class Depth(NamedTuple):
     """Depth (y, x) of the centre view, mm from the lens, and its standard deviation.
 
-    sigma_mm follows from that of the disparity; None without one. The geometry counts as exact, and
-    where the search took one surface for another, depth is further off.
+    sigma_mm follows from that of the disparity; None without one. The geometry counts as exact.
     """
 
     mm: Array
@@ -140,7 +135,7 @@ class LightFieldArray:
         searched = self.maps.get("disparity_sigma")
         if searched is None:
             return Depth(depth, None)
-        return Depth(depth, optics.sigma_mm(depth, SEARCH_MISSES * searched))
+        return Depth(depth, optics.sigma_mm(depth, searched))
 
     def to_xarray(self) -> Any:
         """Return an xarray.Dataset (v, u, y, x, c): light field, deviation, disparity, depth.

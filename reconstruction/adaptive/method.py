@@ -54,7 +54,7 @@ from emmc_rig.reconstruction.adaptive.times import (
     of_samples,
     surveyed_together,
 )
-from emmc_rig.reconstruction.adaptive.uncertainty import within_db
+from emmc_rig.reconstruction.adaptive.uncertainty import disparity_deviation, within_db
 from emmc_rig.reconstruction.inputs import Readings
 from emmc_rig.reconstruction.result import WITHIN, Progress, Reconstruction, Status
 
@@ -296,8 +296,9 @@ def _result_of(
     """
     given, psi = survey.given, survey.given.psi
     size, k = psi.size, psi.binning
-    disparity_sigma = np.sqrt(search.variance_per_pixel(believed, size, k))
-    mean = averaged(survey, fits, disparity_sigma)
+    volumes = [believed] if believed is searched else [believed, searched]
+    moments = [search.moments_per_pixel(volume, size, k) for volume in volumes]
+    mean = averaged(survey, fits, np.sqrt(moments[0].variance))
     residual = (given.frames - psi.forward(mean.light_field)).astype(np.float32)
     centre = fits.scene.centre
     if len(fits.centres) > 1:
@@ -305,7 +306,7 @@ def _result_of(
         centre = np.take_along_axis(np.stack(fits.centres), shares.argmax(axis=0)[None], 0)[0]
     maps = {
         "disparity": centre,
-        "disparity_sigma": disparity_sigma,
+        "disparity_sigma": disparity_deviation(centre, moments),
         "texture": _texture_map(searched, size, k),
         **({} if mean.sigma is None else {"sigma": mean.sigma}),
     }

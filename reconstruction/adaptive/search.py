@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -538,8 +539,15 @@ def _samples(volume: Volume, size: tuple[int, int], binning: int) -> Places:
     return places(volume, rows, columns)
 
 
-def variance_per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:
-    """Return the variance of the disparity of every sample (y, x) over what the patches believe."""
+class Moments(NamedTuple):
+    """Mean and variance of the disparity of every sample (y, x) over what the patches believe."""
+
+    mean: NDArray[np.float32]
+    variance: NDArray[np.float32]
+
+
+def moments_per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> Moments:
+    """Return the moments of the disparity of every sample."""
     at = _samples(volume, size, binning)
     mean, square = (
         interpolated(
@@ -547,7 +555,7 @@ def variance_per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> N
         )
         for power in (1, 2)
     )
-    return np.maximum(square - np.square(mean), 0)
+    return Moments(mean, np.maximum(square - np.square(mean), 0))
 
 
 def per_pixel(volume: Volume, size: tuple[int, int], binning: int) -> NDArray[np.float32]:

@@ -1,7 +1,10 @@
 """The parametric and mixed methods on a bench that is wrong in every way they do not know."""
 
+import itertools
 import re
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from whiteboard_bench import (
 )
 
 from emmc_rig.calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
+from emmc_rig.calibration.causes import HOLES, LAMP, FoundCause, through_pinhole
 from emmc_rig.calibration.choice import HeldOut, choose, judge, predicted_by_shadow
 from emmc_rig.calibration.defects import find_defects, loss_variance, mask_with_losses
 from emmc_rig.calibration.errors import CalibrationError
@@ -292,6 +296,20 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     assert fit.moved_um == pytest.approx(3.0, rel=0.2)
 
 
+@pytest.mark.parametrize("name", [LAMP, HOLES])
+def test_a_cause_is_named_only_for_whiteboards_where_it_is_far_outside_its_deviation(name, design):
+    boards = synthetic(design, replace(designed_placement(CAMERA), blur_um=3.0))
+    count = sum(map(through_pinhole, boards)) if name == HOLES else len(boards)
+    size = (0.3, 0.1, *[0.0] * (count - 2))
+    few = boards if name == LAMP else [board for board in boards if through_pinhole(board)]
+    for second, chi2, named in ((0.01, 1.0, [few[1].name]), (0.03, 1.0, []), (0.01, 9.0, [])):
+        cause = FoundCause(name, 0.05, 9.0, (), size, (0.1, second, *[0.01] * (count - 2)))
+        fit: Any = SimpleNamespace(causes=(cause,), chi2=chi2)
+        said = [*itertools.chain(*cause_lines(fit, boards, MASK))]
+        assert len(said) == len(named)
+        assert all(words in line for words, line in zip(named, said, strict=True))
+
+
 def test_a_share_of_the_light_known_to_the_prior_is_as_unsure_as_the_prior():
     count, tolerances = VIEWS[0] * VIEWS[1], Tolerances()
     weights = tuple(tuple(row) for row in np.linspace(0.5, 1.5, count).reshape(VIEWS).tolist())
@@ -312,7 +330,13 @@ def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):
     fit = fit_placement(boards, CAMERA, MASK)
     assert any(name.startswith("aperture") for name in fit.undecided)
     assert fit.more_boards > 0
-    assert "too few whiteboards" in fit_advice(fit)[-1]
+    few = fit_advice(fit, boards)[-1]
+    assert "too few whiteboards" in few
+    assert few.endswith("through a pinhole")
+    pinholes = [
+        replace(boards[0], views_open=only) for only in np.eye(9, dtype=bool).reshape(-1, *VIEWS)
+    ]
+    assert "pinhole" not in fit_advice(fit, [*boards, *pinholes])[-1]
     enough = fit_placement(synthetic(design, designed_placement(CAMERA), 0.005), CAMERA, MASK)
     assert enough.undecided == ()
     assert enough.more_boards == 0

@@ -458,8 +458,10 @@ def test_the_frames_of_a_film_are_exposed_alike_and_once(edit):
 
 def test_time_and_disk_of_a_film_are_estimated_from_its_rate():
     run = Run(FILM.replace("frames: 12", "frames: 200"))
-    expected = estimated(run.session.frames, run.plan, run.rig)
+    expected = estimated(run.session.frames, run.plan, replace(run.rig, clock=SYSTEM_CLOCK))
     assert 20 < expected.exposing_s < 21
+    simulated = estimated(run.session.frames, run.plan, run.rig)
+    assert simulated.seconds == pytest.approx(202 * 0.15, rel=0.01)  # its clock waits for nothing
     assert expected.bytes > 202 * 2 * SIZE[0] * SIZE[1]
 
 

@@ -18,12 +18,14 @@ import numpy as np
 import pytest
 import typer
 from matplotlib import pyplot
+from PIL import Image
 from placed import files_of, listed
 from programs import done, program
 
 import emmc_rig as emmc
 from emmc_rig import cli
 from emmc_rig.commands.options import SIZE_VARIABLE
+from emmc_rig.live.steps import NEEDS
 from emmc_rig.process import session_calibration as calibrate_session
 from emmc_rig.session import measured_psi
 
@@ -270,13 +272,49 @@ def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
             assert all(ours.get(path) == before[path] or path in grown for path in lost), lost
 
 
+FIGURE = re.compile(r"\d+(?:\.\d+)?")
+TIMES = re.compile(r"\d+ min(?: \d+ s)?|[\d.]+ m?s\b|\d{4}-\d\d-\d\dT[\d:+]+")
+
+
+def stable(text):
+    """Return the lines of what a command prints without times, sorted, and their figures."""
+    lines = sorted(TIMES.sub("?", " ".join(text.split("\n    "))).splitlines())
+    figures = [float(figure) for line in lines for figure in FIGURE.findall(line)]
+    return [FIGURE.sub("0", line) for line in lines], figures
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("small", "_fitted_once")
-def test_the_tutorial_as_typed_ends_in_trust():
-    page = ROOT / "docs" / "tutorial.md"
-    typed = [words for why, found in blocks(page) if why is None for words in found]
-    said = {words[0]: "".join(program(*words)[1:]) for words in typed}
-    assert re.search(r"^trust: ", said["reconstruct"], re.M), said["reconstruct"]
+def test_the_tutorial_as_typed_prints_and_shows_what_the_page_says_and_ends_in_trust(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.delenv(SIZE_VARIABLE)
+    page = (ROOT / "docs" / "tutorial.md").read_text()
+    script = runpy.run_path(str(ROOT / "docs" / "pictures" / "draw_tutorial.py"))
+    steps = script["STEP"].findall(page)
+    typed = [shlex.join(words) for _, found in blocks(ROOT / "docs/tutorial.md") for words in found]
+    assert [step[len("emmc-rig ") :] for step, _ in steps] == typed
+    for step, shown in steps:
+        code, out, err = program(*shlex.split(step)[1:])
+        words, figures = stable(script["printed"](out + err, Path.cwd()))
+        assert code == 0, err
+        assert words == stable(shown)[0]
+        np.testing.assert_allclose(figures, stable(shown)[1], rtol=0.1)
+    assert re.search("^trust: ", shown, re.M)
+    for name, figure in script["figures"](Path.cwd()).items():
+        assert f"(pictures/tutorial-{name}.webp)" in page
+        figure.savefig(f"{name}.webp", dpi=script["DOTS_PER_INCH"])
+        now, stored = (
+            np.asarray(Image.open(path / f"{prefix}{name}.webp").convert("L"), dtype=float) / 255
+            for path, prefix in ((Path.cwd(), ""), (ROOT / "docs" / "pictures", "tutorial-"))
+        )
+        assert np.abs(now - stored).mean() < 0.02
+
+
+def test_the_steps_of_day_one_are_those_of_the_live_page():
+    page = " ".join((ROOT / "docs" / "day-one.md").read_text().split())
+    assert f"Five steps: {', '.join(NEEDS)}." in page
+    commands = getattr(typer.main.get_command(cli.app), "commands", {})
+    assert f": {', '.join(NEEDS)}." in commands["live"].help
 
 
 def test_the_page_of_results_its_charts_and_the_readmes_table_are_what_the_command_makes():

@@ -90,10 +90,13 @@ def test_a_result_has_its_depth_in_mm_and_is_refocused_on_one(result):
     depth = result.depth_mm()
     assert depth.mm.shape == np.shape(depth.sigma_mm) == (40, 52)
     assert np.corrcoef(depth.mm.ravel(), result.disparity.ravel())[0, 1] < -0.9
+    optics = optics_of(emmc.camera("rgbw-bayer-1shot"), 700.0)
+    foretold_mm = optics.sigma_mm(depth.mm, result.maps["disparity_sigma"])  # widened once
+    np.testing.assert_allclose(depth.sigma_mm, foretold_mm, rtol=1e-6)
     nearer = result.depth_mm(focus_mm=400.0)
     assert np.median(nearer.mm) < np.median(depth.mm)
     assert nearer.sigma_mm.mean() < depth.sigma_mm.mean()
-    px = optics_of(emmc.camera("rgbw-bayer-1shot"), 700.0).disparity_of(650.0)
+    px = optics.disparity_of(650.0)
     np.testing.assert_array_equal(result.refocus(depth_mm=650.0), result.refocus(px))
     assert result.refocus(depth_mm=650.0, focus_mm=650.0).shape == (40, 52, 3)
 

@@ -8,6 +8,7 @@ import pytest
 from planes import plane_scene, textured
 from scipy.stats import multivariate_t
 
+import emmc_rig as emmc
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.frames import Frames, even_frames
@@ -31,15 +32,17 @@ from emmc_rig.reconstruction.adaptive.search import (
     _shared,
     _spanned,
     compatibility,
+    moments_per_pixel,
     per_pixel,
     posteriors,
-    variance_per_pixel,
 )
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings
 from emmc_rig.reconstruction.adaptive.survey import checked, surveyed
 from emmc_rig.reconstruction.adaptive.sweep import plane_frames, swept
 from emmc_rig.reconstruction.adaptive.uncertainty import (
     FEATURES,
+    SEARCH_MISSES,
+    disparity_deviation,
     features,
     foretold_db,
     held_out,
@@ -351,6 +354,30 @@ def test_sigma_is_calibrated_on_the_planted_plane(planted):
         assert known[..., :12].mean() < 0.9 * known[..., -20:].mean()
 
 
+def test_a_disparity_is_as_unsure_as_its_error_where_a_search_believes_in_another_surface():
+    rng, stated = np.random.default_rng(0), np.float32(0.2)
+    of_one = rng.normal(stated, 0.1, 100_000)
+    of_two = np.where(rng.random(100_000) < 0.3, of_one + 2.0, of_one)
+    for searches, true in (((of_one,), of_one), ((of_one, of_two), of_two)):
+        moments = [
+            search.Moments(*np.array([[[px.mean()]], [[px.var()]]], np.float32)) for px in searches
+        ]
+        found = disparity_deviation(np.array([[stated]]), moments)
+        error_px = float(np.sqrt(np.mean((true - stated) ** 2)))
+        assert float(found[0, 0]) == pytest.approx(SEARCH_MISSES * error_px, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_disparities_of_a_wide_scene_are_within_what_is_stated():
+    camera, scene = emmc.camera("scenario-ii-cfa"), emmc.scene("wide-disparity", (96, 96))
+    psi = camera.psi(scene.size)
+    result = emmc.reconstruct(psi, camera.expose(scene, 0, psi))
+    assert scene.disparity_px is not None
+    missed = np.abs(result.maps["disparity"] - scene.disparity_px) / result.maps["disparity_sigma"]
+    assert (missed < 2).mean() > 0.75  # 0.48 of the spread of a single search
+    assert (missed < 1).mean() < 0.9
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "at_least"), [("adaptive", 11), ("adaptive-fast", 9)])
 def test_intervals_hold_true_psnrs_and_deviations_most_errors(method, at_least):
@@ -510,7 +537,7 @@ def test_beliefs_of_two_grids_are_averaged_where_they_disagree():
     np.testing.assert_allclose(per_pixel(volume, (7, 7), 1), expected, rtol=1e-5)
     mean = 0.4 * 0.25 + 0.1
     variance = 0.4 * 0.25**2 + 0.1 - mean**2
-    np.testing.assert_allclose(variance_per_pixel(volume, (7, 7), 1), variance, rtol=1e-5)
+    np.testing.assert_allclose(moments_per_pixel(volume, (7, 7), 1).variance, variance, rtol=1e-5)
     assert np.all(per_pixel(replace(volume, between=None), (7, 7), 1) == 0)
 
 
