@@ -170,17 +170,6 @@ def test_forward_is_its_plain_definition_and_reaches_no_other_colour(coded_camer
     assert not psi.to_scipy().toarray()[:, unseen.ravel()].any()
 
 
-def test_kernels_meet_one_layout_of_the_colour_map():
-    """Each layout would be compiled for: maps that lie otherwise in memory are copied."""
-    weights = np.ones((2, 1, 1, 4, 1, 6), np.float32)
-    colour = np.arange(48, dtype=np.uint8).reshape(2, 4, 6) % 3
-    for given in (colour, colour[..., ::-1], np.broadcast_to(colour[:1], colour.shape)):
-        kept = Psi(weights, given).colour
-        assert kept is not None
-        assert kept.flags.c_contiguous
-        np.testing.assert_array_equal(kept, given)
-
-
 @pytest.mark.parametrize("binning", [1, 2, 3])
 @pytest.mark.parametrize("cfa", TILES, ids=str)
 def test_an_open_camera_reads_1_from_a_white_light_field(cfa, binning):
@@ -213,14 +202,6 @@ def test_shots_behind_filters_share_no_light_between_colours(cfa, binning):
     assert_operator_equals_matrix(psi)
     assert not psi.gram[0, 1].any()
     assert psi.gram[0, 2].any()
-
-
-def test_a_pixel_behind_the_wrong_filter_sees_nothing():
-    psi = build_imaging_matrix(camera({}, "rggb", shots=[{"filter": "red"}]), (4, 4))
-    seen = psi.forward(np.ones(psi.light_field_shape, dtype=np.float32))[0]
-    expected = np.zeros((4, 4))
-    expected[::2, ::2] = 1
-    np.testing.assert_allclose(seen, expected, atol=20 * EPS)
 
 
 def test_the_light_efficiency_of_an_rgbw_mask_is_a_half():
@@ -267,12 +248,6 @@ def test_repeated_shots_are_singular_without_a_ridge(distance_mm):
     with pytest.raises(SensingError, match=r"singular at 72 pixels.*use a ridge above 0"):
         psi.inverted_blocks(0.0)
     assert np.isfinite(psi.inverted_blocks(1e-3)).all()
-
-
-def test_dark_pixels_are_singular_without_a_ridge():
-    psi = build_imaging_matrix(camera({}, "rggb", shots=[{"filter": "red"}]), (4, 4))
-    with pytest.raises(SensingError, match="singular at 12 pixels"):
-        psi.inverted_blocks(0.0)
 
 
 @pytest.mark.parametrize("ridge", [-1e-3, float("nan")])
