@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from programs import done, refused
+from programs import done
 
 from emmc_rig.bench.hands import AskingAttendant, NoAttendant, hole_name
 from emmc_rig.bench.hardware import Fitted, simulated_rig
@@ -164,14 +164,6 @@ def test_wrong_holes_are_named_and_asked_for_again(tmp_path, monkeypatch, run):
             assert 0 < entry.deviation_um["aperture_x"] < 400
             assert abs(entry.read_um["aperture_x"] - entry.commanded_um["aperture_x"]) < 500
     assert session.is_complete
-
-
-def test_a_simulated_rig_with_an_axis_that_no_bench_has_is_refused(tmp_path, run):
-    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
-    (tmp_path / "rig.yaml").write_text("kind: simulated\naxes: [mask_z]\n")
-    assert "mask_z is no axis of the bench: use mask_x, mask_y" in refused(
-        run("capture", tmp_path / "plan.yaml", "--rig", tmp_path / "rig.yaml")
-    )
 
 
 def test_a_bench_is_told_what_it_can_do_and_what_one_more_part_would_buy(tmp_path, run):
