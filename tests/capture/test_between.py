@@ -194,11 +194,7 @@ def test_a_hook_is_called_again_where_a_fault_made_the_stage_home():
 
 
 def test_what_a_hook_may_note_is_what_json_keeps():
-    assert plain({"a": np.int64(3), "b": [1.5, "x"], "c": {"d": float("inf")}}) == {
-        "a": 3,
-        "b": [1.5, "x"],
-        "c": {"d": "Infinity"},
-    }
+    assert plain({"b": [1.5, "x"], "c": {"d": np.inf}}) == {"b": [1.5, "x"], "c": {"d": "Infinity"}}
     with pytest.raises(TypeError, match="numbers, texts, lists and mappings, not object"):
         plain({"a": object()})
 

@@ -18,24 +18,20 @@ from watching import Acting
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
 from emmc_rig.captures.control import Control, interruptible
-from emmc_rig.captures.faults import GaveUpError, Mending, check, mending
-from emmc_rig.captures.plan import Checks, Retries
+from emmc_rig.captures.faults import GaveUpError
+from emmc_rig.captures.plan import Retries
 from emmc_rig.captures.run import (
     begun_session,
-    disk_faults_named,
     new_session,
     planned_frames,
     refuse_other_devices,
 )
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.dng import encode_dng
-from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.formats.scenes import fine_scene
-from emmc_rig.session.brightness import figures
 from emmc_rig.session.journal import ComparedEntry, FrameEntry, RetryEntry, RunEntry, of_kind
-from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 from emmc_rig.simulators.clock import ManualClock
@@ -347,45 +343,6 @@ def test_a_disk_that_damages_frames_again_and_again_spends_the_budget_of_the_ses
     assert set(session.stored) == {frame.id for frame in session.frames} - spoilt
 
 
-def test_what_has_to_be_mended_follows_from_the_fault():
-    found = [mending(DriverError("x"), attempt) for attempt in range(1, 8)]
-    assert found[0] == Mending(wait_s=0.1)
-    assert [step.wait_s for step in found] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0]
-    assert [step.reopen_camera for step in found] == [False, False, True, False, False, True, False]
-
-
-def planned(kind):
-    return PlannedFrame("f", kind, Bench("scene", "white", 0, 0, True), 0.01)
-
-
-def frame_at(level, seed=0):
-    rng = np.random.default_rng(seed)
-    dn = np.clip(100 + rng.normal(level, 20, SIZE), 0, 4000)
-    return decode_raw(encode_dng(dn.astype(np.uint16), "rggb", 100, 4000, 0.01))
-
-
-@pytest.mark.parametrize(
-    ("kind", "level", "line"),
-    [
-        ("shot", 6000, "saturated in"),
-        ("shot", -100, "is black"),
-        ("whiteboard", 6000, "lower whiteboards.exposure_s in the plan"),
-        ("dark", 900, "not dark"),
-    ],
-)
-def test_a_frame_that_cannot_be_right_is_refused(kind, level, line):
-    frame = frame_at(level)
-    with pytest.raises(DriverError, match=line):
-        check(planned(kind), frame, figures(frame), None, Checks())
-
-
-def test_a_frame_that_comes_twice_is_refused_and_another_one_is_not():
-    frame, other = frame_at(900), frame_at(900, seed=1)
-    check(planned("shot"), other, figures(other), frame.mosaic, Checks())
-    with pytest.raises(DriverError, match="is identical to the frame before it"):
-        check(planned("shot"), frame, figures(frame), frame.mosaic.copy(), Checks())
-
-
 def test_the_stage_moves_on_while_a_frame_is_written():
     """The disk holds each frame's write back until the stage has moved to another place."""
     rig = still_rig()
@@ -428,17 +385,6 @@ def test_a_clock_that_jumps_back_changes_no_span_and_no_order():
             assert 0 <= began_s <= ended_s
     names = [e.id for e in of_kind(session.journal.entries, FrameEntry)]
     assert names == [frame.id for frame in session.frames]
-
-
-def test_a_full_disk_is_reported_in_one_line_with_what_is_safe():
-    rig = still_rig()
-    session, plan = started(rig, disk=SimulatedDisk(capacity_bytes=25_000))
-    line = "disk is full; make room, then run the same"
-    with pytest.raises(AppError, match=line) as reported, disk_faults_named(session):
-        Sequencer(session, plan, rig).run()
-    assert f"{len(session.stored)} of {len(session.frames)} frames are safe" in str(reported.value)
-    assert rig.attendant.lamp == "off"
-    assert rig.stage.stops == 1
 
 
 def test_a_session_goes_on_whose_rig_was_described_by_keys_of_an_earlier_version(tmp_path):

@@ -16,6 +16,7 @@ import tifffile
 from fuzzing import FUZZ
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from view_files import png
 
 from emmc_rig.bench.device_config import parse_camera, parse_stage
 from emmc_rig.bench.rig_config import ImagedRig, rig_description
@@ -86,25 +87,16 @@ SETTINGS = "from emmc_rig.model.reading import read_yaml", "read_yaml(path, Valu
 SCENE = "from emmc_rig.formats.scenes import open_scene", "open_scene(str(path))"
 
 
-def png(columns, rows, depth, kind, interlace, data, damage=0):
-    def chunk(name, content):
-        body = name + content
-        checksum = zlib.crc32(body) ^ (damage if name == b"IHDR" else 0)
-        return struct.pack(">I", len(content)) + body + struct.pack(">I", checksum)
-
-    header = struct.pack(">IIBBBBB", columns, rows, depth, kind, 0, 0, interlace)
-    palette = chunk(b"PLTE", bytes(6)) if kind == 3 else b""
-    parts = chunk(b"IHDR", header) + palette + chunk(b"IDAT", zlib.compress(data))
-    return b"\x89PNG\r\n\x1a\n" + parts + chunk(b"IEND", b"")
-
-
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        (png(600, 447_392, 1, 3, 1, bytes(1_800_000)), "pixels, more than 1842 bytes can hold"),
-        (png(16_384, 16_384, 255, 2, 0, bytes(1_800_000)), "255 bits a sample of colour type 2"),
-        (png(16_384, 16_384, 8, 5, 0, bytes(1_800_000)), "8 bits a sample of colour type 5"),
-        (png(8, 8, 8, 2, 0, bytes(200), damage=1), "cut short or damaged"),
+        (
+            png(600, 447_392, 1, 3, bytes(1_800_000), interlace=1),
+            "pixels, more than 1842 bytes can hold",
+        ),
+        (png(16_384, 16_384, 255, 2, bytes(1_800_000)), "255 bits a sample of colour type 2"),
+        (png(16_384, 16_384, 8, 5, bytes(1_800_000)), "8 bits a sample of colour type 5"),
+        (png(8, 8, 8, 2, bytes(200), damage=1), "cut short or damaged"),
     ],
     ids=["unpacks to too much", "depth", "colour type", "checksum"],
 )
@@ -259,7 +251,7 @@ def test_a_zarr_group_without_its_shards_is_not_read_whole(tmp_path):
 @pytest.mark.parametrize("ending", ["png", "tif"])
 def test_a_view_whose_name_holds_another_number_is_named_at_once(tmp_path, ending):
     for name in ("view_0_0", "view_0_1", "view_99999_99999"):
-        (tmp_path / f"{name}.{ending}").write_bytes(png(2, 2, 8, 2, 0, bytes(14)))
+        (tmp_path / f"{name}.{ending}").write_bytes(png(2, 2, 8, 2, bytes(14)))
     said, megabytes, seconds = watched(*SCENE, tmp_path)
     assert (
         f"3 views do not fill 100000x100000, as view_99999_99999.{ending} asks for; names are "

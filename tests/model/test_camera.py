@@ -141,23 +141,6 @@ def test_a_mask_that_is_not_described_cannot_be_used(tmp_path, path, value, wher
     assert message.endswith("which is not among: near, far")
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("", "holds nothing, where settings"),
-        ("- a\n- b\n", "holds a list, where settings"),
-        ("title: [open\n", "not valid YAML at line"),
-        ("title: a\nborn: 2001-13-45\n", "not valid YAML"),
-    ],
-)
-def test_a_file_that_is_no_description_is_refused(tmp_path, text, complaint):
-    path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    with pytest.raises(CameraError, match=complaint) as fault:
-        load_camera(path)
-    assert "\n" not in str(fault.value)
-
-
 def offsets(camera, name="near"):
     return [shot.offset_um.get(name) for shot in camera.shots]
 

@@ -175,20 +175,6 @@ def test_views_outside_of_the_pupil_have_no_coefficients_and_are_named():
     assert "(4, 3) 6 % open; views (0, 2), (2, 0), (2, 4), (4, 2) 28 % open" in narrow
 
 
-def test_the_day_one_lens_opens_its_corners_by_a_seventh():
-    """25 mm of round pupil behind 5 x 5 views of 5 mm; views of 3.5 mm lie wholly inside."""
-    camera = camera_with({"diameter_mm": 25})
-    shares = camera.view_shares()
-    assert shares[0, :2] == pytest.approx([0.14, 0.77], abs=0.005)
-    assert shares.sum() * 25 == pytest.approx(np.pi * 12.5**2, rel=1e-3)
-    assert camera.warnings() == [
-        "views (0, 0), (0, 4), (4, 0), (4, 4) 14 % open in the lens's pupil: less light, more noise"
-    ]
-    narrower = camera_with({"diameter_mm": 25}, aperture_cell_mm=3.5)
-    assert (narrower.view_shares() == 1).all()
-    assert narrower.warnings() == []
-
-
 @pytest.mark.parametrize(
     ("pupil", "line"),
     [

@@ -4,7 +4,6 @@ import copy
 import errno
 import hashlib
 import json
-import os
 import shutil
 import zlib
 from dataclasses import replace
@@ -33,7 +32,6 @@ from emmc_rig.progress import Watcher
 from emmc_rig.session.board_sets import decoded
 from emmc_rig.session.journal import (
     FrameEntry,
-    Journal,
     RetryEntry,
     RunEntry,
     count_stored,
@@ -41,8 +39,7 @@ from emmc_rig.session.journal import (
     encode_line,
     of_kind,
 )
-from emmc_rig.session.lock import held
-from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
+from emmc_rig.session.session import FRAMES, JOURNAL, PLAN, Frozen, Session
 from emmc_rig.session.verify import verify
 
 ROOT = Path("/disk")
@@ -282,16 +279,6 @@ def test_a_line_with_any_flipped_bit_does_not_count():
             assert decode_line(bytes(damaged)) is None
 
 
-def test_a_line_after_a_torn_one_is_read(tmp_path):
-    path = tmp_path / "j"
-    first, two, three = (RetryEntry(id="a", fault="x", attempt=n) for n in (1, 2, 3))
-    path.write_bytes(encode_line(first) + encode_line(two)[:-9])
-    Journal(SYSTEM_DISK, path).append(three)
-    again = Journal(SYSTEM_DISK, path)
-    assert again.entries == [first, three]
-    assert again.unreadable == 1
-
-
 def test_a_linked_name_leads_no_bytes_out_of_the_session(tmp_path, monkeypatch):
     monkeypatch.setattr("secrets.token_hex", lambda count: "0" * 2 * count)
     outside = tmp_path / "outside"
@@ -416,13 +403,6 @@ def test_a_power_cut_in_an_amendment_leaves_the_plan_before_or_the_one_after(und
         assert {name: now[name] for name in taken} == taken
     assert held_by[0] == 0
     assert len(held_by) == 4 * 5 + 2
-
-
-def test_two_programs_do_not_work_on_one_session(on_disk):
-    who = rf"held by `.*` \(process {os.getpid()} on .*, since "
-    with held(on_disk.folder), pytest.raises(AppError, match=who), held(on_disk.folder):
-        pass
-    assert not (on_disk.folder / LOCK).exists()
 
 
 def test_a_folder_that_is_no_session_is_reported(tmp_path):
