@@ -183,8 +183,6 @@ class Devices:
         wanted = {a: um for a, um in self._driven_um(planned).items() if sent.get(a) != um}
         if not wanted:
             return False
-        for axis in wanted:
-            sent.pop(axis, None)
         zero_um = self._rig.zero_um
         self._rig.stage.move_to_um({axis: zero_um[axis] + um for axis, um in wanted.items()})
         sent.update(wanted)

@@ -4,6 +4,7 @@ import copy
 import errno
 import hashlib
 import json
+import os
 import shutil
 import zlib
 from dataclasses import replace
@@ -39,7 +40,8 @@ from emmc_rig.session.journal import (
     encode_line,
     of_kind,
 )
-from emmc_rig.session.session import FRAMES, JOURNAL, PLAN, Frozen, Session
+from emmc_rig.session.lock import held
+from emmc_rig.session.session import FRAMES, JOURNAL, LOCK, PLAN, Frozen, Session
 from emmc_rig.session.verify import verify
 
 ROOT = Path("/disk")
@@ -403,6 +405,13 @@ def test_a_power_cut_in_an_amendment_leaves_the_plan_before_or_the_one_after(und
         assert {name: now[name] for name in taken} == taken
     assert held_by[0] == 0
     assert len(held_by) == 4 * 5 + 2
+
+
+def test_two_programs_do_not_work_on_one_session(on_disk):
+    who = rf"held by `.*` \(process {os.getpid()} on .*, since "
+    with held(on_disk.folder), pytest.raises(AppError, match=who), held(on_disk.folder):
+        pass
+    assert not (on_disk.folder / LOCK).exists()
 
 
 def test_a_folder_that_is_no_session_is_reported(tmp_path):
