@@ -17,17 +17,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Self
 
-import serial
 from pydantic import Field, model_validator
 
-from emmc_rig.drivers.ports import find_port
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.program import run_program
+from emmc_rig.drivers.transport import SerialTransport
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.settings import Settings
 
@@ -137,10 +137,8 @@ def _asking(config: SourceConfig) -> Iterator[Callable[[], str]]:
         yield partial(run_program, words, config.limit_s)
     else:
         port = _Port(config)
-        try:
+        with closing(port):
             yield port.ask
-        finally:
-            port.close()
 
 
 def _read_file(path: Path) -> str:
@@ -153,33 +151,27 @@ class _Port:
 
     def __init__(self, config: SourceConfig) -> None:
         self._config = config
-        self._port: serial.Serial | None = None
+        self._wire: SerialTransport | None = None
 
     def ask(self) -> str:
         """Return the line that the question brings."""
         config = self._config
         try:
-            if self._port is None:
+            if self._wire is None:
                 assert config.serial is not None
-                self._port = serial.serial_for_url(
-                    find_port(config.serial),
-                    config.baud,
-                    timeout=config.limit_s,
-                    write_timeout=config.limit_s,
+                self._wire = SerialTransport(
+                    config.serial, config.limit_s, config.limit_s, baud=config.baud
                 )
             if config.ask:
-                self._port.reset_input_buffer()
-                self._port.write(config.ask.encode())
-            line = self._port.read_until(b"\n", MOST_BYTES)
-            if not line:
-                raise TimeoutError(f"gave no answer within {config.limit_s:g} s")
-        except Exception:
+                self._wire.discard_input()
+                self._wire.write(config.ask.encode())
+            return self._wire.read_until(b"\n").decode(errors="replace")
+        except DriverError:
             self.close()
             raise
-        return line.decode(errors="replace")
 
     def close(self) -> None:
         """Close it; closing twice is allowed."""
-        port, self._port = self._port, None
-        if port is not None:
-            port.close()
+        if self._wire is not None:
+            self._wire.close()
+            self._wire = None

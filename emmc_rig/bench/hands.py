@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from typing import Protocol
 
 import numpy as np
 
@@ -16,31 +15,30 @@ ON_A_HOLE = 0.25
 """Of an aperture cell: as far from a hole's middle a place still means that hole."""
 
 
-class Attendant(Protocol):
+class Attendant:
     """What a person, or a relay, does at the bench between exposures."""
 
     def set_lamp(self, colour: str) -> None:
         """Light the scene or the board: off, white, red, green or blue."""
-        ...
 
     def place(self, target: str, turn_deg: float = 0.0) -> None:
         """Put the "scene" or the "whiteboard" before the camera; the board turned in its plane."""
-        ...
 
     def fit_masks(self, shot: int, fitted: bool = True) -> None:
         """Fit the masks and the filter of a shot; or only its filter, the masks taken out."""
-        ...
 
     def move(self, offsets_um: Mapping[str, float]) -> None:
         """Bring axes that the stage has not to their places, from where each is centred."""
-        ...
 
     def again(self, axes: Collection[str]) -> None:
         """Take what `move` did with these axes for undone: the frame shows something else."""
-        ...
 
 
-class AskingAttendant:
+class NoAttendant(Attendant):
+    """An `Attendant` of a bench on which nothing ever changes."""
+
+
+class AskingAttendant(Attendant):
     """An `Attendant` who is a person: asked, and asked again only when something changes.
 
     zero_um, window_um: as of `Rig`.
@@ -113,25 +111,6 @@ class AskingAttendant:
         if self._done.get(what) != wish:
             self._ask(wish)
             self._done[what] = wish
-
-
-class NoAttendant:
-    """An `Attendant` of a bench on which nothing ever changes."""
-
-    def set_lamp(self, colour: str) -> None:
-        """Leave the lamp as it is."""
-
-    def place(self, target: str, turn_deg: float = 0.0) -> None:
-        """Leave the board or scene where it is."""
-
-    def fit_masks(self, shot: int, fitted: bool = True) -> None:
-        """Leave the masks in or out."""
-
-    def move(self, offsets_um: Mapping[str, float]) -> None:
-        """Leave mask and aperture where they are."""
-
-    def again(self, axes: Collection[str]) -> None:
-        """Nothing was asked."""
 
 
 def hole_at(camera: Camera, offsets_um: Mapping[str, float]) -> tuple[int, int] | None:

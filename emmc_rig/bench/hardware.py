@@ -196,7 +196,7 @@ class SimulatedRig(Rig):
     lamp: ArduinoLamp | None = field(kw_only=True)
 
 
-class SimulatedAttendant:
+class SimulatedAttendant(Attendant):
     """An `Attendant` that acts on the simulated bench.
 
     at_um: gets where a hand puts what no axis moves; hands_um: how far off at most.

@@ -9,7 +9,6 @@ another mask place.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -62,9 +61,9 @@ def amendment(
     before = validated(Plan, session.plan_data(), place, AppError)
     earlier = validated(Camera, session.camera, str(session.folder), CameraError)
     changes = differences(plan, before)
-    if _plain(camera) != _plain(earlier) and not changes:
+    if camera != earlier and not changes:
         changes.append("camera")
-    if json.loads(json.dumps(dict(rig))) != session.rig:
+    if dict(rig) != session.rig:
         changes.append("rig")
     if not changes:
         return None
@@ -92,7 +91,7 @@ def amendment(
 
 def _refuse_other_camera(session: Session, plan: Plan, camera: Camera, earlier: Camera) -> None:
     """Raise AppError unless the camera is the one by which frames were taken."""
-    now, then = _plain(camera), _plain(earlier)
+    now, then = (described.model_dump(mode="json") for described in (camera, earlier))
     if {**now, "shots": []} != {**then, "shots": []}:
         raise AppError(
             f"{plan.camera}: the camera was edited since session {session.folder.name} began; "
@@ -137,7 +136,3 @@ def _difference(edited: PlannedFrame, taken: PlannedFrame) -> str:
             return f"its {name} as {item}, not {other}"
     same = replace(edited.bench, fitting=0) == replace(taken.bench, fitting=0)
     return "" if same else "another bench for it"
-
-
-def _plain(camera: Camera) -> dict[str, Any]:
-    return json.loads(json.dumps(camera.model_dump(mode="json")))

@@ -128,7 +128,8 @@ def plain(facts: Mapping[str, Any]) -> dict[str, Any]:
             f"note() takes numbers, texts, lists and mappings, not {type(value).__name__}"
         )
 
-    return json.loads(json.dumps(facts, default=of_numpy), parse_constant=str)
+    text = json.dumps(facts, default=of_numpy)
+    return json.loads(text, parse_constant=str)  # noqa: TID251 - the text of the line above
 
 
 def _load(value: str) -> Hook:

@@ -231,11 +231,8 @@ class HandPlaces:
         middle = tuple(
             slice(cut, side - cut) for cut, side in zip(self._cut, frame.mosaic.shape, strict=True)
         )
-        bench, mosaic, black_dn = (
-            planned.bench,
-            frame.mosaic[middle],
-            frame.black_by_place()[middle],
-        )
+        bench, mosaic = planned.bench, frame.mosaic[middle]
+        black_dn = frame.black_by_place()[middle]
         opened = views_open(self._camera.views, planned.view, planned.window)
         x_um, y_um = (bench.offsets_um.get(axis, 0.0) for axis in MASK)
         channels = channels_of(self._layout, bench.shot)

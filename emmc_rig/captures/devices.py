@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 
 from emmc_rig.bench.hardware import FOCUS, STAGE_AXES, Rig, RigType
 from emmc_rig.captures.faults import FrameRefusedError, Mending
@@ -86,15 +86,6 @@ class Sent:
     gain: float | None = None
 
 
-class Asked(NamedTuple):
-    """When an exposure was asked for."""
-
-    wall: str
-    """By the time of day, ISO 8601."""
-    clock_s: float
-    """On the clock of the rig, in seconds."""
-
-
 class Spans:
     """The seconds from the start of a run in which each step of a frame began and ended."""
 
@@ -116,12 +107,13 @@ class Spans:
 class Devices:
     """Stage, camera and attendant of a rig, as a capture by a plan uses them.
 
-    asked: when the last exposure was. homings: how often the stage was homed.
+    asked_wall, asked_s: when the last exposure was asked for, by the time of day, ISO 8601, and on
+    the clock of the rig. homings: how often the stage was homed.
     """
 
     def __init__(self, rig: Rig, plan: Plan, wall: Callable[[], str] = wall_time) -> None:
         self._rig, self._plan, self._wall = rig, plan, wall
-        self.asked = Asked("", 0.0)
+        self.asked_wall, self.asked_s = "", 0.0
         self.camera = rig.camera
         self.sent = Sent()
         self.homings = 0
@@ -187,14 +179,13 @@ class Devices:
 
     def move(self, planned: PlannedFrame) -> bool:
         """Bring the stage to its place; returns whether it moved."""
-        wanted = self._wanted_um(planned)
+        sent = self.sent.offsets_um
+        wanted = {a: um for a, um in self._driven_um(planned).items() if sent.get(a) != um}
         if not wanted:
             return False
-        for axis in wanted:
-            self.sent.offsets_um.pop(axis, None)
         zero_um = self._rig.zero_um
         self._rig.stage.move_to_um({axis: zero_um[axis] + um for axis, um in wanted.items()})
-        self.sent.offsets_um |= wanted
+        sent.update(wanted)
         return True
 
     def settle(self) -> None:
@@ -262,7 +253,7 @@ class Devices:
 
     def ask(self) -> None:
         """Remember that an exposure is asked for now."""
-        self.asked = Asked(self._wall(), self._rig.clock.now_s())
+        self.asked_wall, self.asked_s = self._wall(), self._rig.clock.now_s()
 
     def focus(
         self, planned: PlannedFrame, exposure_s: float, span_um: float, stopped: Callable[[], bool]
@@ -316,11 +307,6 @@ class Devices:
                 for axis in stage.axes
             },
         }
-
-    def _wanted_um(self, planned: PlannedFrame) -> dict[str, float]:
-        """Return by axis where the stage does not stand yet, from each axis's zero."""
-        sent = self.sent.offsets_um
-        return {axis: um for axis, um in self._driven_um(planned).items() if sent.get(axis) != um}
 
     def _driven_um(self, planned: PlannedFrame) -> dict[str, float]:
         """Return a frame's place on the axes that the stage has."""

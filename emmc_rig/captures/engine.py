@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,30 +37,13 @@ from emmc_rig.session.session import Session
 Facts = Mapping[str, Any]
 
 
-class Prepared(NamedTuple):
-    """For what the plan's hook was called last."""
-
-    frame_id: str
-    """"" after the last frame."""
-    homings: int
-    """How often the stage was homed by then: a hook's own setting may be lost by homing."""
-
-
-class Focused(NamedTuple):
-    """How focusing ended."""
-
-    found: FocusFound | None
-    """The sharpest position; None without a peak, or after a stop."""
-    fault: str
-    """Why no peak was seen, in words; "" otherwise."""
-
-
 class Engine:
     """Takes one frame of a session at a time on the devices of a rig.
 
     devices: of the rig. before: mosaic of the frame before, None where equal frames are no fault.
-    prepared: for what the hook was called last; None: it is called for any frame. wall: the time
-    of day.
+    prepared: the frame's id ("" after the last one) and the number of homings when the hook was
+    called last, whose own setting may be lost by homing; None: it is called for any frame. wall:
+    the time of day.
     """
 
     def __init__(
@@ -74,12 +57,12 @@ class Engine:
         hook: Between | None,
         wall: Callable[[], str],
     ) -> None:
-        self._session, self._plan, self._rig = session, plan, rig
-        self._recorder, self._exposures = recorder, exposures
-        self._control, self._hook = control, hook
+        self.session, self.plan, self.rig = session, plan, rig
+        self.recorder, self._exposures = recorder, exposures
+        self.control, self._hook = control, hook
         self.devices = Devices(rig, plan, wall)
         self.before: NDArray[np.uint16] | None = None
-        self.prepared: Prepared | None = None
+        self.prepared: tuple[str, int] | None = None
         self._places = places_in_session(session, rig, plan)
         # How long the frame before took to hand over: its own line is written by then.
         self._handed_s: dict[str, tuple[float, float]] = {}
@@ -95,7 +78,7 @@ class Engine:
 
         attempt: counted from 1. about: what else the journal line says, asked once exposed.
         """
-        devices, span = self.devices, Spans(self._recorder.now_s, self._recorder.emit_step)
+        devices, span = self.devices, Spans(self.recorder.now_s, self.recorder.emit_step)
         with span("attend", planned):
             devices.attend(planned)
         if self._hook is not None:
@@ -107,14 +90,14 @@ class Engine:
             beside = {**devices.beside(), "environment": self._read_sources()}
         with span("check", planned):
             may_saturate = self._exposures.may_saturate(planned)
-            check(planned, frame, found, self.before, self._plan.checks, may_saturate)
+            check(planned, frame, found, self.before, self.plan.checks, may_saturate)
             place = self._places.found(planned, frame)
             if place is not None:
                 read_um |= place.um
                 unsure_um = dict.fromkeys(place.um, place.deviation_um)
-        self._recorder.emit_taken(planned, frame, found)
+        self.recorder.emit_taken(planned, frame, found)
         span.seconds.update(self._handed_s)
-        handing = Spans(self._recorder.now_s, self._recorder.emit_step)
+        handing = Spans(self.recorder.now_s, self.recorder.emit_step)
         with handing("hand over", planned):
             self.hand_over(
                 planned,
@@ -146,41 +129,43 @@ class Engine:
             # Only asked for where it is needed: a camera may read its next frame for that.
             camera.exposure_s if frame.exposure_s is None else frame.exposure_s,
             camera.gain if frame.gain is None else frame.gain,
-            run=self._recorder.run,
-            plan=self._session.amendments,
+            run=self.recorder.run,
+            plan=self.session.amendments,
             lamp=planned.bench.lamp,
-            triggered=self._plan.trigger is not None,
+            triggered=self.plan.trigger is not None,
             lamp_read=self.devices.sent.lamp_read,
             commanded_um=dict(planned.bench.offsets_um),
             figures=found,
-            wall=self.devices.asked.wall,
-            monotonic_s=self.devices.asked.clock_s,
+            wall=self.devices.asked_wall,
+            monotonic_s=self.devices.asked_s,
             **about,
         )
         self._exposures.learn(planned, entry)
-        self._recorder.store(planned, frame, entry, spans_s)
+        self.recorder.store(planned, frame, entry, spans_s)
         self.before = frame.mosaic
 
     def set_up(self, planned: PlannedFrame) -> None:
         """Let the bench stand as a frame needs it, the stage settled; nothing is exposed."""
         self.devices.attend(planned)
         self.prepare(planned)
-        if self.devices.move(planned) and self._plan.settle_s:
+        if self.devices.move(planned) and self.plan.settle_s:
             self.devices.settle()
 
     def shift_since(self, planned: PlannedFrame, entry: FrameEntry) -> Shift:
         """Take a stored frame once more; return how far the picture is shifted from it."""
-        then = decode_frame(self._session.read(planned.id), entry)
+        then = decode_frame(self.session.read(planned.id), entry)
         self.set_up(planned)
         return registered(self.devices.snap(planned, entry.exposure_s)[0], then)
 
-    def focus(self, planned: PlannedFrame, span_um: float, from_um: list[float]) -> Focused:
+    def focus(
+        self, planned: PlannedFrame, span_um: float, from_um: list[float]
+    ) -> FocusFound | str | None:
         """Bring the focus axis to where the scene of a frame is sharpest.
 
         from_um: filled with where the axis stood at the first attempt, from which later attempts
-        begin. Where no peak is seen the axis is back there.
+        begin. Returns why no peak is seen, with the axis back there; None after a stop.
         """
-        stage = self._rig.stage
+        stage = self.rig.stage
         self.devices.attend(planned)
         self.prepare(planned)
         self.devices.move(planned)
@@ -190,24 +175,23 @@ class Engine:
             from_um.append(stage.position_um(FOCUS))
         exposure_s = self.exposure_s(planned)
         try:
-            found = self.devices.focus(planned, exposure_s, span_um, lambda: self._control.stopping)
+            return self.devices.focus(planned, exposure_s, span_um, lambda: self.control.stopping)
         except AppError as unseen:
-            return Focused(None, str(unseen))
-        return Focused(found, "")
+            return str(unseen)
 
     def prepare(self, planned: PlannedFrame | None) -> None:
         """Call the plan's hook, once a frame, and again where the stage was homed since.
 
         planned: None after the last one. Raises `HookError`; `StopCapture` before a frame.
         """
-        hook, devices, recorder = self._hook, self.devices, self._recorder
-        now = Prepared("" if planned is None else planned.id, devices.homings)
+        hook, devices, recorder = self._hook, self.devices, self.recorder
+        now = ("" if planned is None else planned.id, devices.homings)
         if hook is None or self.prepared == now:
             return
         recorder.flush()
         began_s, noted, fault = recorder.now_s(), dict[str, Any](), "stopped"
-        rig = replace(self._rig, camera=devices.camera)
-        self._control.between_frames = True
+        rig = replace(self.rig, camera=devices.camera)
+        self.control.between_frames = True
         try:
             hook.call(rig, planned, lambda **facts: noted.update(plain(facts)))
             fault = ""
@@ -217,11 +201,11 @@ class Engine:
                 raise
         except (Exception, SystemExit) as error:
             fault = hook.shown(error)
-            raise HookError(hook, now.frame_id, error) from error
+            raise HookError(hook, now[0], error) from error
         finally:
-            self._control.between_frames = False
+            self.control.between_frames = False
             entry = HookEntry(
-                id=now.frame_id,
+                id=now[0],
                 name=hook.name,
                 notes=noted,
                 fault=fault,
@@ -236,7 +220,7 @@ class Engine:
 
     def exposure_s(self, planned: PlannedFrame) -> float:
         """Return the exposure to ask the camera for."""
-        recorded_s = self._rig.recorded_s.get(planned.id)
+        recorded_s = self.rig.recorded_s.get(planned.id)
         if recorded_s is not None:
             return recorded_s
         limits_s = self.devices.camera.exposure_limits_s
@@ -254,11 +238,11 @@ class Engine:
 
     def _read_sources(self) -> dict[str, float]:
         """Return what the rig's sources say; one that fails, or does again, is noted once."""
-        values, faults = read_all(self._rig.sources)
+        values, faults = read_all(self.rig.sources)
         for name in faults.keys() | self._faults_of_sources.keys():
             fault = faults.get(name, "")
             if fault != self._faults_of_sources.get(name, ""):
                 told = f"environment, {name}: {fault or 'gives values again'}"
-                self._recorder.note(SourceEntry(name=name, fault=fault), told)
+                self.recorder.note(SourceEntry(name=name, fault=fault), told)
         self._faults_of_sources = faults
         return values

@@ -19,11 +19,9 @@ from threading import Event
 from typing import Any, Literal, NamedTuple, Self
 
 from emmc_rig.bench.hardware import Rig
-from emmc_rig.captures.control import Control
 from emmc_rig.captures.engine import Engine, Facts
 from emmc_rig.captures.faults import check, is_same
 from emmc_rig.captures.plan import Plan
-from emmc_rig.captures.recorder import Recorder
 from emmc_rig.captures.schedule import pace_of
 from emmc_rig.drivers.camera import Camera as CameraDevice
 from emmc_rig.drivers.clock import SYSTEM_CLOCK
@@ -33,7 +31,6 @@ from emmc_rig.errors import AppError
 from emmc_rig.session.brightness import figures
 from emmc_rig.session.journal import DroppedEntry, FilmEntry, LateEntry, of_kind
 from emmc_rig.session.planned import PlannedFrame
-from emmc_rig.session.session import Session
 
 RING_BYTES = 256_000_000
 """Of frames that wait for the disk: some seconds of most cameras, little beside a result."""
@@ -213,21 +210,16 @@ class FilmRun:
 
     def __init__(
         self,
-        session: Session,
-        plan: Plan,
-        rig: Rig,
         engine: Engine,
-        recorder: Recorder,
-        control: Control,
         take: Callable[[PlannedFrame, Callable[[], Facts]], None],
         finish: Callable[[PlannedFrame], None],
     ) -> None:
-        assert plan.film is not None
-        self._session, self._rig, self._engine = session, rig, engine
-        self._recorder, self._control = recorder, control
+        assert engine.plan.film is not None
+        self._engine, self._session, self._rig = engine, engine.session, engine.rig
+        self._recorder, self._control = engine.recorder, engine.control
         self._take, self._finish = take, finish
-        self._plan, self._rate_hz = plan, plan.film.rate
-        self._segment = len(of_kind(session.journal.entries, FilmEntry)) - 1
+        self._plan, self._rate_hz = engine.plan, engine.plan.film.rate
+        self._segment = len(of_kind(self._session.journal.entries, FilmEntry)) - 1
         # On the clock of the rig, when the first frame of the segment was asked for.
         self._began_s: float | None = None
 
@@ -342,7 +334,7 @@ class FilmRun:
 
     def _when(self, planned: PlannedFrame) -> Facts:
         """Return the segment of a frame, and its time in seconds from the segment's first."""
-        asked_s = self._engine.devices.asked.clock_s
+        asked_s = self._engine.devices.asked_s
         if self._began_s is None:
             self._began_s = asked_s
         recorded = bool(self._rig.recorded_s)

@@ -142,32 +142,27 @@ class Recorder:
         spans_s: dict[str, tuple[float, float]],
     ) -> None:
         """Hand a frame and its journal line to the thread that writes them."""
-        self._writer.put(partial(self._store, planned, frame, entry, spans_s))
 
-    def _store(
-        self,
-        planned: PlannedFrame,
-        frame: RawFrame,
-        entry: FrameEntry,
-        spans_s: dict[str, tuple[float, float]],
-    ) -> None:
-        self.emit_step("write", planned)
-        began_s = self.now_s()
-        file = frame_file(frame, entry.wall, self._serial)
+        def write() -> None:
+            self.emit_step("write", planned)
+            began_s = self.now_s()
+            file = frame_file(frame, entry.wall, self._serial)
 
-        def written() -> FrameEntry:
-            spans = {**spans_s, "write": (began_s, self.now_s())}
-            return entry.model_copy(update={"spans_s": spans})
+            def written() -> FrameEntry:
+                spans = {**spans_s, "write": (began_s, self.now_s())}
+                return entry.model_copy(update={"spans_s": spans})
 
-        self._session.store(planned, file, written)
-        self._done += 1
-        self.emit("frame.written", **named(planned), done=self._done, planned=self._planned)
-        shot = planned.bench.shot
-        left = self._left_of_shot.get(shot, set())
-        if planned.id in left:
-            left.remove(planned.id)
-            if not left:
-                self.emit("shot.done", shot=shot)
+            self._session.store(planned, file, written)
+            self._done += 1
+            self.emit("frame.written", **named(planned), done=self._done, planned=self._planned)
+            shot = planned.bench.shot
+            left = self._left_of_shot.get(shot, set())
+            if planned.id in left:
+                left.remove(planned.id)
+                if not left:
+                    self.emit("shot.done", shot=shot)
+
+        self._writer.put(write)
 
     def discard_damaged(self, ids: Iterable[str]) -> dict[str, str]:
         """Read files again; return the faults of damaged files, which no longer count, by id."""

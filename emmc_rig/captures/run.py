@@ -144,8 +144,7 @@ def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session 
     """
     if is_session(request.out):
         session = Session(request.out, disk)
-        asked = json.loads(json.dumps(dict(request.rig)))
-        begun = AnyRig.under_new_names(session.rig)
+        asked, begun = dict(request.rig), AnyRig.under_new_names(session.rig)
         # How the lights are switched shows in no frame, and may be corrected.
         if session.stored and asked | {"lights": None} != begun | {"lights": None}:
             raise AppError(

@@ -114,10 +114,7 @@ class Sequencer:
         )
         self._film = None
         if plan.film is not None:
-            self._film = FilmRun(
-                session, plan, rig, self._engine, self._recorder, self._control, self._take_frame,
-                self._count_taken,
-            )  # fmt: skip
+            self._film = FilmRun(self._engine, self._take_frame, self._count_taken)
         self._pace = pace_of(rig, plan)
         self._remaining_reported_s = -REMAINING_TIME_INTERVAL_S
         self._budget = Budget(plan.retries)
@@ -349,18 +346,18 @@ class Sequencer:
         assert self._plan.focus is not None
         began_s, from_um = self._recorder.now_s(), list[float]()
         span_um = self._plan.focus.span_um
-        found, fault = self._retrying(
+        found = self._retrying(
             planned.id, lambda attempt: self._engine.focus(planned, span_um, from_um)
         )
-        if found is None and not fault:
+        if found is None:
             return False
         self._focused_at = self._taken
         entry = FocusEntry(
             id=planned.id,
             from_um=from_um[0],
-            place_um=None if found is None else found.place_um,
-            deviation_um=None if found is None else found.deviation_um,
-            fault=fault,
+            place_um=None if isinstance(found, str) else found.place_um,
+            deviation_um=None if isinstance(found, str) else found.deviation_um,
+            fault=found if isinstance(found, str) else "",
             at_s=began_s,
             seconds=round(self._recorder.now_s() - began_s, 6),
         )

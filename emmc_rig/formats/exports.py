@@ -102,11 +102,7 @@ def film_of(spec: str) -> Film | None:
 
 
 def open_film(folder: Path) -> Film:
-    """Open a film.
-
-    Raises:
-        AppError: no film, or a film with missing files.
-    """
+    """Open a film; raises AppError for no film, or a film with missing files."""
     rate, times_s = _times(folder)
     listing = Listing.read(folder)
     gone = [name for name in listing.files if not (folder / name).is_file()] if listing else []

@@ -66,10 +66,6 @@ def _write_folder(folder: Path, export: Export) -> None:
         config.write(file)
 
 
-def _holds_folder(path: Path) -> bool:
-    return (path / "input_Cam000.png").is_file()
-
-
 def _read_folder(path: Path) -> Array:
     config = configparser.ConfigParser()
     try:
@@ -105,10 +101,6 @@ def _write_hdf5(folder: Path, export: Export) -> None:
         )  # fmt: skip
 
 
-def _holds_hdf5(path: Path) -> bool:
-    return path.suffix.lower() in (".h5", ".hdf5") and holds_array(path, "LF")
-
-
 def _read_hdf5(path: Path) -> Array:
     with stored_arrays(path, AppError, "copy it again") as stored:
         pictures = stored.array("LF")
@@ -120,7 +112,12 @@ def _read_hdf5(path: Path) -> Array:
 FORMATS = (
     Format(
         "hci", "folder of the HCI 4D benchmark: input_Cam###.png, parameters.cfg, PFM disparity",
-        "8-bit sRGB; disparity", _write_folder, _holds_folder, _read_folder, parallax=True,
+        "8-bit sRGB; disparity", _write_folder,
+        lambda path: (path / "input_Cam000.png").is_file(), _read_folder, parallax=True,
     ),
-    Format("hci-hdf5", "HDF5 of HCI's: LF", "8-bit sRGB", _write_hdf5, _holds_hdf5, _read_hdf5),
+    Format(
+        "hci-hdf5", "HDF5 of HCI's: LF", "8-bit sRGB", _write_hdf5,
+        lambda path: path.suffix.lower() in (".h5", ".hdf5") and holds_array(path, "LF"),
+        _read_hdf5,
+    ),
 )  # fmt: skip

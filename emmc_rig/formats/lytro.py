@@ -35,10 +35,6 @@ def _write_mat(folder: Path, export: Export) -> None:
     )
 
 
-def _holds_mat(path: Path) -> bool:
-    return path.suffix.lower() == ".mat" and path.exists()
-
-
 def _read_mat(path: Path) -> Array:
     pictures = read_stored(path, AppError, "LF").array
     if pictures.ndim == 4:  # MATLAB drops a last axis of length 1
@@ -59,10 +55,6 @@ def _write_eslf(folder: Path, export: Export) -> None:
     write_picture(folder / name, woven.reshape(height * rows, width * columns, colours))
 
 
-def _holds_eslf(path: Path) -> bool:
-    return path.is_file() and ESLF.fullmatch(path.name) is not None
-
-
 def _read_eslf(path: Path) -> Array:
     match = ESLF.fullmatch(path.name)
     assert match is not None
@@ -78,10 +70,10 @@ def _read_eslf(path: Path) -> Array:
 FORMATS = (
     Format(
         "lftoolbox", "light_field.mat for LFToolbox", "16 bits, linear", _write_mat,
-        _holds_mat, _read_mat,
+        lambda path: path.suffix.lower() == ".mat" and path.exists(), _read_mat,
     ),
     Format(
         "eslf", "light_field_VxU_eslf.png, views interleaved", "16-bit sRGB", _write_eslf,
-        _holds_eslf, _read_eslf,
+        lambda path: path.is_file() and ESLF.fullmatch(path.name) is not None, _read_eslf,
     ),
 )  # fmt: skip

@@ -94,10 +94,6 @@ def _write_image(path: Path, data: Any, export: Export, film: Film | None = None
     (path / ".zmetadata").unlink(missing_ok=True)
 
 
-def _holds(path: Path) -> bool:
-    return (path / ".zattrs").is_file()
-
-
 def _read(path: Path) -> Array:
     try:
         attributes = parse_json((path / ".zattrs").read_bytes(), ".zattrs", ValueError)
@@ -116,6 +112,7 @@ def _read(path: Path) -> Array:
 FORMATS = (
     Format(
         "ome-zarr", f"{NAME}, multiscale, a plane along z a view",
-        "32-bit floating values, linear", _write, _holds, _read, write_film=_write_film,
+        "32-bit floating values, linear", _write,
+        lambda path: (path / ".zattrs").is_file(), _read, write_film=_write_film,
     ),
 )  # fmt: skip

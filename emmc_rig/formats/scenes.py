@@ -197,17 +197,9 @@ def fine_scene(
     `aperture_factor` comes back 1 whatever was asked (one view stands for all a x a of a cell);
     its pixels are interpolated by a cubic whose p x p block means are the measured samples.
 
-    Args:
-        spec: as for `open_scene`.
-        aperture_factor: fine views per view, along each axis.
-        pixel_factor: fine pixels per pixel, along each axis.
-        size: as for `open_scene`, on the coarse grid.
-        views: as for `open_scene`, on the coarse grid.
-        seed: as for `open_scene`.
-        time_s: time in a built-in scene that moves; other scenes are the same at all times.
-
-    Raises:
-        SceneError: as for `open_scene`, or a factor below 1.
+    aperture_factor, pixel_factor: fine views per view and fine pixels per pixel, along each axis.
+    time_s: in a built-in scene that moves. spec, seed: as for `open_scene`, likewise size and
+    views, on the coarse grid. Raises SceneError as `open_scene`, and for a factor below 1.
     """
     if min(aperture_factor, pixel_factor) < 1:
         raise SceneError(

@@ -41,14 +41,10 @@ OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6
 
 
 def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:
-    """Return `lf` as contiguous float32, or say what keeps it from being a light field.
+    """Return `lf` as contiguous float32; right is floating (v, u, y, x, 3) in [0, 1], two views.
 
-    Args:
-        lf: anything; right is a floating (v, u, y, x, 3) array in [0, 1] of two views or more.
-        source: where it came from, for the message.
-
-    Raises:
-        SceneError: wrong shape or type, or a sample that is not finite or not in [0, 1].
+    source: where it came from, for the message. Raises SceneError for another shape or type, and
+    where a sample is not finite or not in [0, 1].
     """
     lf = np.asarray(lf)
     remedy = light_field_remedy(lf)
@@ -74,14 +70,10 @@ def check_light_field(lf: np.ndarray, source: str) -> np.ndarray:
 
 
 def load_views(folder: str | os.PathLike) -> np.ndarray:
-    """Read a folder of pictures `view_ROW_COL.png`, or `.tif` or `.exr`, RGB or grey.
+    """Return the light field of pictures `view_ROW_COL.png`, or `.tif` or `.exr`, RGB or grey.
 
-    Returns:
-        (v, u, y, x, 3), code values divided by the full scale; floating values as they are.
-
-    Raises:
-        SceneError: no such folder; no views, missing views or views with other names; files that
-            are damaged or no pictures; pictures of different sizes.
+    Code values are divided by the full scale; floating values are as they are. Raises SceneError
+    for missing views, views with other names or of different sizes, and damaged files.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -158,13 +150,9 @@ def grid_of_views(paths: Mapping[tuple[int, int], Path], folder: Path) -> tuple[
 
 
 def load_hdf5(path: str | os.PathLike) -> np.ndarray:
-    """Read the dataset `light_field` of an HDF5 file: floating in [0, 1], or 8- or 16-bit codes.
+    """Return the dataset `light_field` of an HDF5 file: floating in [0, 1], or 8- or 16-bit codes.
 
-    Returns:
-        (v, u, y, x, 3).
-
-    Raises:
-        SceneError: no such file, not HDF5 or cut short, no such dataset, or not a light field.
+    Raises SceneError for no such file or dataset, a damaged one, or no light field.
     """
     path = Path(path)
     with stored_arrays(path, SceneError, "copy it again") as stored:
@@ -194,15 +182,10 @@ def load_view_axes(path: str | os.PathLike) -> ViewAxes:
 def save_hdf5(
     path: str | os.PathLike, lf: np.ndarray, attributes: Mapping[str, str | int | float]
 ) -> None:
-    """Write float32 dataset `light_field`; the file appears whole or not at all.
+    """Write float32 dataset `light_field` with its attributes; the file appears whole or not.
 
-    Args:
-        path: its folder is created where missing.
-        lf: (v, u, y, x, 3); values outside [0, 1], which no light field has, are clipped.
-        attributes: kept on the dataset.
-
-    Raises:
-        SceneError: not a light field even when clipped, or the file cannot be written.
+    The folder is made where missing. Values of lf (v, u, y, x, 3) outside [0, 1] are clipped.
+    Raises SceneError for no light field even when clipped, or where nothing can be written.
     """
     path = Path(path)
     if not (lf.min() >= 0 and lf.max() <= 1):
@@ -226,11 +209,7 @@ def centre_view(lf: np.ndarray) -> np.ndarray:
 
 
 def replicate_centre(lf: np.ndarray) -> np.ndarray:
-    """The centre view in place of every view: the estimate without parallax that others must beat.
-
-    Returns:
-        (v, u, y, x, c), a read-only view of `lf`'s memory.
-    """
+    """The centre view in place of every view, read-only: the estimate that others must beat."""
     return np.broadcast_to(centre_view(lf), lf.shape)
 
 
@@ -242,13 +221,8 @@ def epi_horizontal(lf: np.ndarray, v: int, y: int) -> np.ndarray:
 def shear(lf: np.ndarray, disparity_px: float) -> np.ndarray:
     """Shift every view so that points of this disparity stay where the centre view has them.
 
-    Args:
-        lf: (v, u, y, x, c).
-        disparity_px: pixels per view step.
-
-    Returns:
-        (v, u, y, x, c) float32: lf[v, u, y + d (v - V // 2), x + d (u - U // 2)], as `shifted`
-        interpolates it.
+    disparity_px: d, pixels per view step. Returns (v, u, y, x, c) float32, interpolated by
+    `shifted`: lf[v, u, y + d (v - V // 2), x + d (u - U // 2)].
     """
     sheared = np.empty(lf.shape, np.float32)
     for v, u in np.ndindex(lf.shape[:2]):
@@ -259,18 +233,10 @@ def shear(lf: np.ndarray, disparity_px: float) -> np.ndarray:
 
 
 def shifted(view: np.ndarray, shift_y_px: float, shift_x_px: float) -> np.ndarray:
-    """Sample a view between its pixels, at (y + shift_y_px, x + shift_x_px).
+    """Sample a view (y, x, c), float32, between its pixels, at (y + shift_y_px, x + shift_x_px).
 
     Catmull-Rom interpolation: exact for whole pixels and for polynomials of the second degree;
     may overshoot a little at edges. Beyond the view's edge its last pixel continues.
-
-    Args:
-        view: (y, x, c) float32.
-        shift_y_px: downwards.
-        shift_x_px: to the right.
-
-    Returns:
-        (y, x, c) float32.
     """
     height, width = view.shape[:2]
     # OpenCV's warps round coordinates to 1/32 pixel; a constant shift, a convolution, need not.
@@ -312,14 +278,11 @@ BACK_TO_FRONT = 5, 50, 95
 
 
 def focus_disparities(lf: np.ndarray) -> tuple[float, float, float]:
-    """Estimate where the scene's back, middle and front are, by a plane sweep over the views.
+    """Return the disparities of the scene's back, middle and front, pixels per view step.
 
     The disparity at which the views agree best is found per textured pixel, on views shrunk to
     at most 256 columns and within 4 % of the width; the 5th, 50th and 95th percentiles come back,
     after two sweeps over the range just found. Good enough to choose a focus, not a depth map.
-
-    Returns:
-        (back, middle, front) in pixels per view step, ascending.
     """
     small, shrink = small_grey_views(lf, 256)
     width = small.shape[3]
@@ -348,12 +311,7 @@ def sum_of_squares(values: np.ndarray) -> float:
 def psnr_db(estimate: np.ndarray, truth: np.ndarray) -> float:
     """Peak signal-to-noise ratio, -10 log10(mean squared error), dB; infinite for equal samples.
 
-    Args:
-        estimate: any shape.
-        truth: the same shape.
-
-    Raises:
-        SceneError: the shapes differ.
+    Raises SceneError where the shapes differ.
     """
     _check_same_shape(estimate, truth)
     squares = 0.0
@@ -372,12 +330,8 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     with means m, variances s^2 and the covariance s_ab of a window: Gaussian, 11x11 pixels, sigma
     1.5; C1 = 0.01^2 and C2 = 0.03^2 for values up to 1. Source: Wang et al. 2004, eq. 13.
 
-    Args:
-        estimate: (v, u, y, x, c).
-        truth: the same shape.
-
-    Raises:
-        SceneError: the shapes differ, or a view is smaller than the window.
+    estimate, truth: (v, u, y, x, c). Raises SceneError where the shapes differ, or a view is
+    smaller than the window.
     """
     _check_same_shape(estimate, truth)
     if min(truth.shape[2:4]) < _SSIM_WINDOW_PX:

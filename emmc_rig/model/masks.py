@@ -124,10 +124,10 @@ class _Random(Pattern):
         for frame in range(frames):
             for index, row in enumerate(_outward(rows)):
                 rng = np.random.default_rng([self.seed, frame, index])
-                cells[frame, row, _outward(columns)] = self.sample(rng, columns)
+                cells[frame, row, _outward(columns)] = self._row(rng, columns)
         return cells
 
-    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    def _row(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         """Return `count` cells, (count, colour); the first of more are the same."""
         raise NotImplementedError
 
@@ -142,8 +142,7 @@ class RandomRGBW(_Random):
 
     kind: Literal["random_rgbw"]
 
-    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-        """Return a row of cells."""
+    def _row(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         return np.array(list(FILTERS.values()), np.float32)[rng.integers(4, size=count)]
 
 
@@ -153,8 +152,7 @@ class RandomBinary(_Random):
     kind: Literal["random_binary"]
     open_probability: float = Field(default=0.5, gt=0, le=1)
 
-    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-        """Return a row of cells."""
+    def _row(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         return _grey(rng.random(count) < self.open_probability)
 
 
@@ -163,8 +161,7 @@ class UniformColour(_Random):
 
     kind: Literal["uniform_colour"]
 
-    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-        """Return a row of cells."""
+    def _row(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         return rng.random((count, 3), dtype=np.float32)
 
 
@@ -175,8 +172,7 @@ class GaussianColour(_Random):
     mean: float = Field(default=0.5, ge=0, le=1)
     deviation: float = Field(default=0.2, ge=0)
 
-    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-        """Return a row of cells."""
+    def _row(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         cells = rng.normal(self.mean, self.deviation, (count, 3))
         return np.clip(cells, 0, 1).astype(np.float32)
 
@@ -188,8 +184,7 @@ class GaussianMonochrome(_Random):
     mean: float = Field(default=0.5, ge=0, le=1)
     deviation: float = Field(default=0.2, ge=0)
 
-    def sample(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-        """Return a row of cells."""
+    def _row(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
         return _grey(np.clip(rng.normal(self.mean, self.deviation, count), 0, 1))
 
 

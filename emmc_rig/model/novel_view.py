@@ -110,10 +110,7 @@ def between(light_field: Array, disparities: Array, v: float, u: float) -> Array
     The colour of a ray is a mean of the four nearest views, each sampled at the ray's surface.
     Views whose disparity contradicts the surface, and occluded surfaces, have small weights.
 
-    Args:
-        light_field: (v, u, y, x, c).
-        disparities: (v, u, y, x), see `view_disparities`.
-        v, u: position, 0 to the number of views less one.
+    light_field: (v, u, y, x, c). disparities: (v, u, y, x), see `view_disparities`. v, u: position.
     """
     y, x = np.mgrid[: light_field.shape[2], : light_field.shape[3]].astype(np.float32)
     least, most = float(disparities.min()), float(disparities.max())

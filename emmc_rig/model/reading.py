@@ -1,8 +1,7 @@
 """Files from outside as plain data: YAML and HDF5, bounded in depth and memory.
 
 Whatever is wrong with a file raises the caller's error with one line that names the file. No other
-module calls these decoders, nor JSON's beside `json_text`: `tests/formats/test_decoders.py` checks
-it.
+module calls these decoders, nor JSON's beside `json_text`: ruff refuses it (TID251).
 Pictures and what other programs wrote: `emmc_rig.model.decoding`.
 """
 

@@ -17,7 +17,7 @@ from simulated_disk import SimulatedDisk
 import emmc_rig as emmc
 from emmc_rig.captures.between import Between, HookError, load_hook, plain
 from emmc_rig.captures.sequencer import Sequencer
-from emmc_rig.session.journal import HaltEntry, HookEntry, RetryEntry, of_kind
+from emmc_rig.session.journal import HaltEntry, HookEntry, of_kind
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 from emmc_rig.simulators.still import StillStage
@@ -73,13 +73,6 @@ def test_a_hook_is_called_before_every_frame_and_after_the_last():
     assert [entry.id for entry in noted(session)] == [*ids, ""]
     assert noted(session)[0].notes == {"power_w": 0.5, "spectrum": [0, 1, 2], "bad": "NaN"}
     assert "between" in session.stored[ids[0]].spans_s
-
-
-def test_frames_are_the_same_bytes_with_a_hook_and_without():
-    plain_session, _ = run(None)
-    hooked, _ = run(lambda rig, frame, note: note(a=1))
-    for frame in plain_session.frames:
-        assert hooked.read(frame.id) == plain_session.read(frame.id)
 
 
 @pytest.mark.parametrize("when", [0, 1, 5, 10])
@@ -159,38 +152,6 @@ def test_axes_that_a_hook_left_alone_are_not_moved_again():
     assert moves[0] == moves[1]
 
 
-class Creeping(StillStage):
-    """A stage whose mask begins to move only after it was read once more."""
-
-    reads: int | None = None
-
-    def position_um(self, axis):
-        if self.reads is not None and axis == "mask_x":
-            self.reads += 1
-            return super().position_um(axis) + (30.0 if self.reads > 1 else 0.0)
-        return super().position_um(axis)
-
-    def move_to_um(self, targets_um):
-        self.reads = None
-        return super().move_to_um(targets_um)
-
-
-def test_a_mask_that_moves_on_after_the_hook_is_noticed_by_the_read_back():
-    rig = still_rig()
-    stage = Creeping(rig.stage.axes, rig.clock)
-
-    def hook(rig, frame, note):
-        if frame is not None and frame.id == "board-s0-v2-u2-white-r1":
-            stage.reads = 0
-
-    text = PLAN.replace("repeats: 1", "repeats: 2")
-    session, outcome = run(hook, replace(rig, stage=stage), text=text)
-    assert outcome.complete
-    (retry,) = of_kind(session.journal.entries, RetryEntry)
-    assert "was exposed while mask_x stood +30.00 um off its place" in retry.fault
-    assert session.stored[retry.id].read_um["mask_x"] == 0.0
-
-
 def test_a_hook_is_called_again_where_a_fault_made_the_stage_home():
     """A further axis, which the hook has put somewhere, is at its reference after homing."""
     rig = still_rig()
@@ -233,11 +194,7 @@ def test_a_hook_is_called_again_where_a_fault_made_the_stage_home():
 
 
 def test_what_a_hook_may_note_is_what_json_keeps():
-    assert plain({"a": np.int64(3), "b": [1.5, "x"], "c": {"d": float("inf")}}) == {
-        "a": 3,
-        "b": [1.5, "x"],
-        "c": {"d": "Infinity"},
-    }
+    assert plain({"b": [1.5, "x"], "c": {"d": np.inf}}) == {"b": [1.5, "x"], "c": {"d": "Infinity"}}
     with pytest.raises(TypeError, match="numbers, texts, lists and mappings, not object"):
         plain({"a": object()})
 

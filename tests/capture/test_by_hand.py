@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from programs import done, refused
+from programs import done
 
 from emmc_rig.bench.hands import AskingAttendant, NoAttendant, hole_name
 from emmc_rig.bench.hardware import Fitted, simulated_rig
@@ -131,22 +131,10 @@ def test_frames_show_where_hands_put_the_pinhole_within_what_they_state(name):
     assert np.sqrt(np.mean(np.square(off))) < 1.6
 
 
-THREE = {(0, 0): (0, 1), (1, 1): (2, 2), (2, 2): (1, 1)}
-TWENTY = {
-    (v, u): tuple(int(index) for index in np.add((v, u), step) % 5)
-    for (v, u), step in zip(
-        list(np.ndindex(5, 5))[::-1][:20], [(0, 1), (1, 0), (1, 1), (4, 4), (2, 3)] * 4, strict=True
-    )
-}
-
-
-@pytest.mark.parametrize(
-    ("swaps", "views"),
-    [(THREE, PLAN["whiteboards"]["views"]), pytest.param(TWENTY, "all", marks=pytest.mark.slow)],
-)
-def test_wrong_holes_are_named_and_asked_for_again(swaps, views, tmp_path, monkeypatch, run):
+def test_wrong_holes_are_named_and_asked_for_again(tmp_path, monkeypatch, run):
     from emmc_rig.bench import hardware
 
+    swaps = {(0, 0): (0, 1), (1, 1): (2, 2), (2, 2): (1, 1)}
     left, asked = dict(swaps), []
     well = hardware.SimulatedAttendant.move
 
@@ -160,8 +148,7 @@ def test_wrong_holes_are_named_and_asked_for_again(swaps, views, tmp_path, monke
         well(self, offsets_um)
 
     monkeypatch.setattr(hardware.SimulatedAttendant, "move", wrong_once)
-    boards = PLAN["whiteboards"] | {"views": views}
-    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN | {"whiteboards": boards}))
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
     (tmp_path / "rig.yaml").write_text("kind: simulated\naxes: [mask_x, mask_y]\nhands_um: 100\n")
     plan, rig = tmp_path / "plan.yaml", tmp_path / "rig.yaml"
     done(run("capture", plan, "--rig", rig, "--size", "48x64", "--rays", 64))
@@ -177,14 +164,6 @@ def test_wrong_holes_are_named_and_asked_for_again(swaps, views, tmp_path, monke
             assert 0 < entry.deviation_um["aperture_x"] < 400
             assert abs(entry.read_um["aperture_x"] - entry.commanded_um["aperture_x"]) < 500
     assert session.is_complete
-
-
-def test_a_simulated_rig_with_an_axis_that_no_bench_has_is_refused(tmp_path, run):
-    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
-    (tmp_path / "rig.yaml").write_text("kind: simulated\naxes: [mask_z]\n")
-    assert "mask_z is no axis of the bench: use mask_x, mask_y" in refused(
-        run("capture", tmp_path / "plan.yaml", "--rig", tmp_path / "rig.yaml")
-    )
 
 
 def test_a_bench_is_told_what_it_can_do_and_what_one_more_part_would_buy(tmp_path, run):

@@ -1,6 +1,5 @@
 """The sequencer: frames, retries, refusals, resumption, and the bench after a capture."""
 
-import errno
 import os
 import signal
 import threading
@@ -19,26 +18,20 @@ from watching import Acting
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.bench.registration import registered
 from emmc_rig.captures.control import Control, interruptible
-from emmc_rig.captures.faults import GaveUpError, Mending, check, mending
-from emmc_rig.captures.plan import Checks, Retries
+from emmc_rig.captures.faults import GaveUpError
+from emmc_rig.captures.plan import Retries
 from emmc_rig.captures.run import (
     begun_session,
-    disk_faults_named,
-    estimated,
     new_session,
     planned_frames,
     refuse_other_devices,
-    refuse_small_disk,
 )
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.dng import encode_dng
-from emmc_rig.drivers.errors import DriverError
 from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.formats.scenes import fine_scene
-from emmc_rig.session.brightness import figures
 from emmc_rig.session.journal import ComparedEntry, FrameEntry, RetryEntry, RunEntry, of_kind
-from emmc_rig.session.planned import Bench, PlannedFrame
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 from emmc_rig.simulators.clock import ManualClock
@@ -129,13 +122,6 @@ def test_references_are_exposed_where_metering_aims(undisturbed):
             assert entry.figures.saturated == 0
 
 
-def test_the_lamp_is_off_when_a_capture_ends(undisturbed):
-    rig = still_rig()
-    session, plan = started(rig)
-    Sequencer(session, plan, rig).run()
-    assert rig.attendant.lamp == "off"
-
-
 def stopped_after(count, text=SMALL):
     """Return a session that was stopped by Ctrl-C once, and what a resume needs."""
     rig, bench = bench_rig(text)
@@ -206,14 +192,6 @@ def test_a_shift_is_registered_to_a_tenth_of_a_pixel():
         assert shift.likeness > 0.9
 
 
-def test_another_camera_is_refused_on_resuming():
-    session, _, rig, _ = stopped_after(9)
-    other = still_rig()
-    with pytest.raises(AppError, match="begun with camera EMMC simulated camera S1"):
-        refuse_other_devices(session, other)
-    refuse_other_devices(session, rig)
-
-
 def test_a_resume_refuses_another_stage_unless_it_is_meant():
     rig, _ = bench_rig(ONE_SHOT)
     session, plan = started(rig, ONE_SHOT)
@@ -268,23 +246,6 @@ class SimpleCamera:
 
     def __init__(self, camera, serial, shape):
         self.identity, self.shape = replace(camera.identity, serial=serial), shape
-
-
-def test_pausing_holds_the_next_frame_until_it_goes_on():
-    rig = still_rig()
-    session, plan = started(rig)
-    control = Control()
-    control.pause()
-    counts = []
-
-    def go_on():
-        counts.append(len(session.stored))
-        control.resume()
-
-    timer = threading.Timer(0.15, go_on)
-    timer.start()
-    assert Sequencer(session, plan, rig, control=control).run().complete
-    assert counts == [0]
 
 
 def test_stopping_now_keeps_what_was_taken_and_leaves_the_bench_safe():
@@ -364,18 +325,6 @@ def test_a_stage_that_cannot_go_on_stops_the_capture_with_a_reason(fault, skip, 
     assert all(e.attempt <= attempts for e in of_kind(session.journal.entries, RetryEntry))
 
 
-def test_a_fault_that_stays_stops_the_capture_with_everything_kept():
-    rig, _ = bench_rig()
-    session, plan = started(rig, retries=Retries(per_frame=2))
-    rig.still.faults.inject("torn_raw", times=float("inf"), skip=4)
-    with pytest.raises(GaveUpError, match="gave up after 3 tries"):
-        Sequencer(session, plan, rig).run()
-    assert len(session.stored) == 4
-    assert not verify(session).damaged
-    rig.still.faults.clear()
-    assert Sequencer(session, plan, rig).run().complete
-
-
 def test_a_disk_that_damages_frames_again_and_again_spends_the_budget_of_the_session():
     rig, _ = bench_rig(ONE_SHOT)
     session, plan = started(rig, ONE_SHOT, retries=Retries(per_session=3))
@@ -392,80 +341,6 @@ def test_a_disk_that_damages_frames_again_and_again_spends_the_budget_of_the_ses
         Sequencer(session, plan, rig, Acting(frame_written=spoil)).run()
     assert len(written) == 4
     assert set(session.stored) == {frame.id for frame in session.frames} - spoilt
-
-
-def test_the_budget_of_the_session_ends_it_too():
-    rig, _ = bench_rig()
-    session, plan = started(rig, retries=Retries(per_session=3))
-    for skip in range(0, 40, 2):
-        rig.still.faults.inject("torn_raw", skip=skip)
-    with pytest.raises(GaveUpError, match="all 3 retries"):
-        Sequencer(session, plan, rig).run()
-    assert session.stored
-
-
-def test_what_has_to_be_mended_follows_from_the_fault():
-    found = [mending(DriverError("x"), attempt) for attempt in range(1, 8)]
-    assert found[0] == Mending(wait_s=0.1)
-    assert [step.wait_s for step in found] == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0]
-    assert [step.reopen_camera for step in found] == [False, False, True, False, False, True, False]
-
-
-def planned(kind):
-    return PlannedFrame("f", kind, Bench("scene", "white", 0, 0, True), 0.01)
-
-
-def frame_at(level, seed=0):
-    rng = np.random.default_rng(seed)
-    dn = np.clip(100 + rng.normal(level, 20, SIZE), 0, 4000)
-    return decode_raw(encode_dng(dn.astype(np.uint16), "rggb", 100, 4000, 0.01))
-
-
-@pytest.mark.parametrize(
-    ("kind", "level", "line"),
-    [
-        ("shot", 6000, "saturated in"),
-        ("shot", -100, "is black"),
-        ("whiteboard", 6000, "lower whiteboards.exposure_s in the plan"),
-        ("dark", 900, "not dark"),
-    ],
-)
-def test_a_frame_that_cannot_be_right_is_refused(kind, level, line):
-    frame = frame_at(level)
-    with pytest.raises(DriverError, match=line):
-        check(planned(kind), frame, figures(frame), None, Checks())
-
-
-def test_a_frame_that_comes_twice_is_refused_and_another_one_is_not():
-    frame, other = frame_at(900), frame_at(900, seed=1)
-    check(planned("shot"), other, figures(other), frame.mosaic, Checks())
-    with pytest.raises(DriverError, match="is identical to the frame before it"):
-        check(planned("shot"), frame, figures(frame), frame.mosaic.copy(), Checks())
-
-
-def test_the_longer_exposures_of_a_bracket_may_saturate():
-    frame = frame_at(6000)
-    check(planned("shot"), frame, figures(frame), None, Checks(), may_saturate=True)
-
-
-def test_a_camera_that_repeats_itself_once_costs_a_try():
-    rig = still_rig()
-    session, plan = started(rig, ONE_SHOT)
-    wire = rig.camera._transport
-    honest = wire.capture
-    seen = []
-
-    def repeating(exposure_s):
-        data = seen[-1] if len(seen) == 1 else honest(exposure_s)
-        seen.append(data)
-        return data
-
-    wire.capture = repeating
-    assert Sequencer(session, plan, rig).run().complete
-    faults = [e.fault for e in of_kind(session.journal.entries, RetryEntry)]
-    assert len(faults) == 1
-    assert "is identical to the frame before it" in faults[0]
-    assert len(set(frames_in(session).values())) == 3
 
 
 def test_the_stage_moves_on_while_a_frame_is_written():
@@ -510,68 +385,6 @@ def test_a_clock_that_jumps_back_changes_no_span_and_no_order():
             assert 0 <= began_s <= ended_s
     names = [e.id for e in of_kind(session.journal.entries, FrameEntry)]
     assert names == [frame.id for frame in session.frames]
-
-
-def test_a_full_disk_is_reported_in_one_line_with_what_is_safe():
-    rig = still_rig()
-    session, plan = started(rig, disk=SimulatedDisk(capacity_bytes=25_000))
-    line = "disk is full; make room, then run the same"
-    with pytest.raises(AppError, match=line) as reported, disk_faults_named(session):
-        Sequencer(session, plan, rig).run()
-    assert f"{len(session.stored)} of {len(session.frames)} frames are safe" in str(reported.value)
-    assert rig.attendant.lamp == "off"
-    assert rig.stage.stops == 1
-
-
-def test_a_read_only_disk_is_reported_in_one_line():
-    rig = still_rig()
-    disk = SimulatedDisk()
-    session, plan = started(rig, disk=disk)
-
-    def refuse(number, name):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    disk.before = refuse
-    with pytest.raises(AppError, match="disk is read-only") as reported, disk_faults_named(session):
-        Sequencer(session, plan, rig).run()
-    assert "\n" not in str(reported.value)
-    assert rig.stage.moves == 0
-
-
-def test_a_disk_that_is_too_small_is_reported_before_anything_is_made():
-    rig = still_rig()
-    request = request_for(Path("/"))
-    expected = estimated(planned_frames(request, rig), request.plan, rig)
-    refuse_small_disk(Path("/"), expected, SimulatedDisk(capacity_bytes=1e12))
-    with pytest.raises(AppError, match="frames need about"):
-        refuse_small_disk(Path("/"), expected, SimulatedDisk(capacity_bytes=1000))
-
-
-@pytest.mark.parametrize(
-    ("text", "mask_um", "line"),
-    [
-        (SMALL, 99_990.0, "mask_x cannot go 270 um"),
-        (ONE_SHOT.replace("0.05", "7200"), 20_000.0, "the camera exposes from"),
-    ],
-)
-def test_a_plan_beyond_stage_or_camera_is_reported_before_anything_moves(text, mask_um, line):
-    rig = still_rig()
-    rig = replace(rig, zero_um={**rig.zero_um, "mask_x": mask_um})
-    session, plan = started(rig, text)
-    with pytest.raises(AppError, match=line):
-        Sequencer(session, plan, rig).run()
-    assert rig.stage.moves == 0
-
-
-def test_frames_of_another_rig_are_refused(tmp_path):
-    rig = still_rig()
-    request = request_for(tmp_path, text=ONE_SHOT)
-    session = new_session(request, planned_frames(request, rig))
-    other = replace(request, rig={"kind": "y"})
-    assert begun_session(other) is not None
-    Sequencer(session, request.plan, rig).run()
-    with pytest.raises(AppError, match="another rig"):
-        begun_session(other)
 
 
 def test_a_session_goes_on_whose_rig_was_described_by_keys_of_an_earlier_version(tmp_path):

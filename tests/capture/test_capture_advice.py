@@ -1,10 +1,8 @@
-"""Every error that a capture can end in: its advice, carried out, ends in a complete session.
+"""Errors that a capture can end in: their advice, carried out, ends in a complete session.
 
-The texts are taken from the source: one without a walk here fails the test, as does a walk without
-its text. A walk brings the fault about, yields what the program said, and does as it says.
+A walk brings the fault about, yields what the program said, and does as it says.
 """
 
-import ast
 import errno
 import hashlib
 import inspect
@@ -15,7 +13,6 @@ import signal
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,61 +39,6 @@ from emmc_rig.session.lock import held
 from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 
-HOUSE = Path(emmc_rig.__file__).parent
-SCANNED = (
-    *sorted(
-        module
-        for module in (HOUSE / "captures").glob("*.py")
-        if not module.name.startswith(("bench_check", "board_plan", "import_"))
-    ),
-    HOUSE / "session" / "session.py",
-    HOUSE / "session" / "lock.py",
-    HOUSE / "commands" / "capture.py",
-    HOUSE / "bench" / "rig_config.py",
-)
-FOLDERS, WRITING_A_PLAN = HOUSE / "store" / "folders.py", ("new_file", "_free")
-NO_CAPTURE = ("direct.py", "simulate.py")
-"""Exposures of the demo and of `simulate`; what `reconstruct` says of a light field is its own."""
-GUARDS = (
-    ": is no list of frames; restore it from a copy",  # nor then would its SHA-256 be the journal's
-    "cannot be metered, the board is dark",  # such a frame is refused as black before
-    "was not captured yet; resume it",  # only frames are read that were hashed just before
-    "is damaged, its SHA-256 is not the journal's",
-    "estimates no accuracy",  # its method does
-    "); resume it",
-    " is no flaw of the bench: use ",  # the simulated rig is described before a session is made
-    ": use round, none, or a lens such as {diameter_mm: 27.5}",  # likewise
-    ": the stage has no such axis, only ",  # a rig is opened before a session is made
-    " is moved by plans: give its zero_um instead",  # likewise
-    # A hook, a focus, sources and axes that are wrong are refused before a session is made.
-    " is a generator or coroutine: write a plain function",
-    "put it beside the plan",
-    ": write module:function, or the name of an entry point of ",
-    " cannot be loaded: ",
-    " is no function of (rig, frame, note): ",
-    "write module:function, as lab:hook, not ",
-    ", or {every: 50}, not ",
-    "focus: the rig has no axis named ",
-    "two sources are named ",
-    " is no axis of the bench: use ",
-    # Walked in test_between.py, test_capture.py and test_focus.py.
-    "note() takes numbers, texts, lists and mappings",
-    ", now it is on ",
-    "no edge above the noise: light the scene",
-    "no sharpest position ",
-    "moved by hand (by_hand: false): write by_hand: true",  # refused before a session is made
-    "shows the shadow through ",  # walked in test_by_hand.py
-    "shows the mask ",
-    # Refused before a session is made: test_trigger.py, test_capture_lights.py.
-    "is not supported by its driver",
-    ": the rig's lights have no ",
-    "the simulated bench has lights of its own: write lights: simulated",
-    "its clock stands still",  # walked in test_film.py
-    "an imported session takes no further frames",  # it is complete; its remedy is another import
-    "its time stamps run backwards",  # walked in test_film.py
-    "no file of it is frame ",  # frames without a file are not taken, but for --until
-)
-"""What other commands print, and what earlier checks keep a capture from."""
 PLAN = {
     "camera": "rgbw-bayer-3shots",
     "shots": [{"exposure_s": 0.01}, {"exposure_s": 0.02}],
@@ -793,32 +735,6 @@ def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
     bench.light.faults.clear()
     assert bench.run(*CAPTURE)[0] == 0
     assert verify(Session(bench.session)).is_complete
-
-
-def texts():
-    """Every text that the scanned modules raise: its place, and its constant parts."""
-    whole = [(path, ast.parse(path.read_text())) for path in SCANNED if path.name not in NO_CAPTURE]
-    folders = ast.parse(FOLDERS.read_text())
-    new_plan = [node for node in folders.body if getattr(node, "name", "") in WRITING_A_PLAN]
-    for path, tree in [*whole, *((FOLDERS, node) for node in new_plan)]:
-        for node in ast.walk(tree):
-            said = node.exc if isinstance(node, ast.Raise) else node
-            of_error = said is not node or ast.unparse(node).startswith("super().__init__(")
-            if isinstance(said, ast.Call) and of_error:
-                raised = [part for part in ast.walk(said) if isinstance(part, ast.Constant)]
-                parts = [part.value for part in raised if isinstance(part.value, str)]
-                yield f"{path.name}:{said.lineno}", [part for part in parts if " " in part.strip()]
-
-
-def test_every_text_has_a_walk_and_every_walk_its_text():
-    known = [*WALKS, *GUARDS]
-    used = set()
-    for place, parts in texts():
-        if parts:
-            found = {text for text in known if any(text in p for p in [*parts, "".join(parts)])}
-            assert found, f"{place}: no walk for {parts}"
-            used |= found
-    assert set(known) - used == set()
 
 
 @pytest.mark.slow

@@ -100,14 +100,3 @@ def test_a_capture_with_a_hook_and_by_hand_killed_at_random_lines_notes_every_fr
         noted = [entry.id for entry in of_kind(session.journal.entries, HookEntry)]
         assert set(noted) == {*session.stored, ""}
         shutil.rmtree(folder)
-
-
-@pytest.mark.slow
-def test_a_capture_killed_again_and_again_is_made_whole(killed, memory_folder, undisturbed):
-    rng = np.random.default_rng(5)
-    folder = memory_folder / "again"
-    for _ in range(40):
-        code, _ = killed("line", int(rng.integers(50, 700)), folder)
-        if code == 0:
-            break
-    assert_made_whole(folder, undisturbed)

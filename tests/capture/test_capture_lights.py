@@ -7,9 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-import yaml
 from capture_rigs import begun, plan_and_camera, request_for
 from programs import done, refused
 from simulated_disk import SimulatedDisk
@@ -21,9 +19,7 @@ from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.drivers.lights import COLOURS
 from emmc_rig.errors import AppError
 from emmc_rig.formats.scenes import fine_scene
-from emmc_rig.session.board_sets import decoded
 from emmc_rig.session.journal import RetryEntry, RunEntry, of_kind
-from emmc_rig.session.session import Session
 from emmc_rig.session.verify import verify
 
 SIZE = (24, 32)
@@ -68,13 +64,6 @@ def test_every_frame_is_lit_as_planned_and_the_journal_has_the_lights_answer():
     run = next(iter(of_kind(session.journal.entries, RunEntry)))
     assert run.lights == {"name": "simulator", "colours": [*COLOURS]}
     assert bench.lamp == "off"
-
-
-def test_frames_are_those_of_a_bench_whose_lamp_a_hand_switches():
-    by_lights, by_hand = (captured(lit_rig(lights)[0]) for lights in (True, False))
-    for lit, unlit in zip(*(decoded(s, s.frames) for s in (by_lights, by_hand)), strict=True):
-        assert np.array_equal(lit.mosaic, unlit.mosaic)
-    assert {entry.lamp_read for entry in by_hand.stored.values()} == {""}
 
 
 def test_lights_that_do_not_answer_stop_the_capture_and_it_goes_on_afterwards():
@@ -148,28 +137,6 @@ def test_settings_of_lights_may_be_corrected_in_a_session_that_has_begun(tmp_pat
     assert begun_session(replace(request, rig={"kind": "real", "lights": lights})) is not None
     with pytest.raises(AppError, match="begun with another rig"):
         begun_session(replace(request, rig={"kind": "real", "window_um": 3.0}))
-
-
-@pytest.mark.slow
-def test_a_whole_calibration_runs_without_a_hand(run, tmp_path, monkeypatch):
-    """The plan, its capture and Psi, by the commands that a user types; only lights switch."""
-    monkeypatch.setattr(
-        "emmc_rig.bench.hardware.SimulatedAttendant.set_lamp",
-        lambda self, colour: pytest.fail("a hand was asked for"),
-    )
-    (tmp_path / "rig.yaml").write_text("kind: simulated\nlights: simulated\n")
-    size = ("--size", "48x64")
-    camera = ("--camera", "rgbw-bayer-1shot")
-    done(run("calibrate", "--plan", *camera, *size, "--target", "0.02", "--out", "cal"))
-    plan = yaml.safe_load(Path("cal/plan.yaml").read_text())
-    assert plan["whiteboards"]["colours"]
-    rig = ("--rig", "rig.yaml", *size, "--rays", "1024")
-    out = done(run("capture", "cal/plan.yaml", *rig))
-    assert "complete" in out
-    out = done(run("calibrate", "cal/plan-session"))
-    assert "doubtful" not in out
-    session = Session(Path("cal/plan-session"))
-    assert {entry.lamp_read for entry in session.stored.values()} == {f"ok {c}" for c in COLOURS}
 
 
 def test_the_command_lists_and_switches_lights_and_says_what_is_wrong(run, tmp_path):

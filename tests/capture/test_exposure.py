@@ -208,12 +208,3 @@ def test_an_edited_level_holds_for_the_shots_that_are_not_taken():
     assert Sequencer(session, edited, rig).run().complete
     taken_s = [session.stored[f"shot-{shot}-e0-r0"].exposure_s for shot in range(3)]
     assert taken_s[1] == taken_s[2] == pytest.approx(taken_s[0] / 2, rel=0.02)
-
-
-def test_less_light_than_metering_asks_for_is_reported_with_its_true_cost_in_noise():
-    text = AUTO.replace("auto", "0.02")
-    session, _ = captured(text)
-    (reason,) = exposure_reasons(shot_exposures(session))
-    level = min(shot.level for shot in shot_exposures(session))
-    assert level == pytest.approx(0.06, abs=0.03)
-    assert f"{10 * np.log10(0.7 / level):.1f} dB" in reason.what

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_rigs import begun, plan_and_camera, still_rig
+from capture_rigs import begun, plan_and_camera
 from programs import done, refused
 from simulated_disk import SimulatedDisk
 
@@ -142,17 +142,6 @@ def test_lost_pulses_of_a_film_are_dropped_frames_by_name_and_reason():
 def test_lines_that_the_camera_lacks_are_refused_by_name(key, value, message):
     with pytest.raises(AppError, match=message):
         run_of(SHOTS.replace(key, value))
-
-
-def test_a_camera_without_lines_is_refused():
-    rig, (plan, _) = still_rig(), plan_and_camera(SHOTS)
-    with pytest.raises(
-        AppError, match="trigger: the camera's trigger is not supported by its driver"
-    ):
-        with_trigger(rig, plan)
-    assert (
-        with_trigger(rig, plan.model_copy(update={"trigger": None, "exposure_output": None})) is rig
-    )
 
 
 class Properties:

@@ -11,9 +11,7 @@ import yaml
 from capture_rigs import begun, frame_in, frames_in, still_rig
 from programs import done, program
 from simulated_disk import SimulatedDisk
-from watching import Acting
 
-from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.captures.until import Until, stated_psnr_db
 from emmc_rig.errors import AppError
 from emmc_rig.model.sensing import Psi
@@ -25,7 +23,6 @@ from emmc_rig.session.verify import summary, verify
 
 pytestmark = pytest.mark.slow
 
-SIZE = (32, 40)
 RIG = ("--rig", "simulated", "--scene", "deep-occlusions", "--size", "32x40", "--rays", "64")
 CAMERA = {
     "title": "nine views",
@@ -189,27 +186,6 @@ def test_a_session_cut_off_at_any_line_of_its_journal_goes_on_to_the_same_end(ev
         shutil.rmtree(copy)
 
 
-def test_a_stop_while_the_light_field_is_judged_keeps_what_was_taken(every, tmp_path):
-    copy = shutil.copytree(every, tmp_path / "copy")
-    whole = (copy / JOURNAL).read_bytes().splitlines(keepends=True)
-    last = next(n for n, line in enumerate(whole) if b'"kind":"decided"' in line)
-    (copy / JOURNAL).write_bytes(b"".join(whole[:last]))
-    rig = still_rig(SIZE)
-    session = Session(copy)
-
-    def stop(event):
-        if "reconstructing" in event.facts["text"]:
-            raise KeyboardInterrupt
-
-    plan = begun(tmp_path, SimulatedDisk(), rig)[1]
-    with pytest.raises(KeyboardInterrupt):
-        Sequencer(session, plan, rig, choose=Until(session, Acting(message=stop))).run()
-    again = Session(copy)
-    assert again.journal.entries[-1].kind == "stopped"
-    assert not of_kind(again.journal.entries, DecidedEntry)
-    assert "shot-0-e0-r0" in again.stored
-
-
 def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_path):
     copy = shutil.copytree(enough, tmp_path / "copy")
     session = Session(copy)
@@ -220,6 +196,22 @@ def test_a_damaged_shot_of_a_session_that_had_enough_is_taken_again(enough, tmp_
     assert "1 taken" in out
     assert frame_in(path.read_bytes()) == frame_in(good)
     assert len(of_kind(Session(copy).journal.entries, DecidedEntry)) == 1
+
+
+def test_what_a_session_needs_follows_from_the_last_instruction(tmp_path: Path):
+    session, _ = begun(tmp_path, SimulatedDisk(), still_rig())
+    shots = {f.bench.shot for f in session.frames if f.kind == "shot"}
+    assert shots == {0, 1}
+    assert session.target_db is None
+    reported = {"shots": [0], "stated_db": 31.0, "target_db": 30.0, "why": "", "spared_frames": 1}
+    session.note(UntilEntry(target_db=30.0))
+    session.note(DecidedEntry(next=1, spared=[], **reported))
+    assert session.needed == session.frames
+    session.note(DecidedEntry(next=None, spared=[1], **reported))
+    assert {f.bench.shot for f in session.needed if f.kind == "shot"} == {0}
+    session.note(UntilEntry(target_db=33.0))
+    assert session.needed == session.frames
+    assert session.target_db == 33.0
 
 
 def test_the_stated_psnr_is_that_of_the_deviation_less_what_few_large_errors_cost():
@@ -238,19 +230,3 @@ def test_the_stated_psnr_is_that_of_the_deviation_less_what_few_large_errors_cos
     assert result_with().stated == {"stated_db": None, "stated_interval_db": None}
     with pytest.raises(AppError, match="estimates no accuracy"):
         stated_psnr_db(result_with())
-
-
-def test_what_a_session_needs_follows_from_the_last_instruction(tmp_path: Path):
-    session, _ = begun(tmp_path, SimulatedDisk(), still_rig())
-    shots = {f.bench.shot for f in session.frames if f.kind == "shot"}
-    assert shots == {0, 1}
-    assert session.target_db is None
-    reported = {"shots": [0], "stated_db": 31.0, "target_db": 30.0, "why": "", "spared_frames": 1}
-    session.note(UntilEntry(target_db=30.0))
-    session.note(DecidedEntry(next=1, spared=[], **reported))
-    assert session.needed == session.frames
-    session.note(DecidedEntry(next=None, spared=[1], **reported))
-    assert {f.bench.shot for f in session.needed if f.kind == "shot"} == {0}
-    session.note(UntilEntry(target_db=33.0))
-    assert session.needed == session.frames
-    assert session.target_db == 33.0

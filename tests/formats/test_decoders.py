@@ -1,8 +1,8 @@
 """Every decoder of bytes from outside is called in one guarded place, and takes bounded memory."""
 
-import ast
 import io
 import json
+import re
 import struct
 import subprocess
 import sys
@@ -16,6 +16,7 @@ import tifffile
 from fuzzing import FUZZ
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from view_files import png
 
 from emmc_rig.bench.device_config import parse_camera, parse_stage
 from emmc_rig.bench.rig_config import ImagedRig, rig_description
@@ -28,128 +29,18 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.decoding.child import read_in_child
 from emmc_rig.model.errors import SensingError
 from emmc_rig.model.sensing import Psi
-from emmc_rig.store.psi import StoredPsi, save_shards
+from emmc_rig.store.psi import StoredPsi
 
 ROOT = Path(__file__).parents[2]
-READING, RAW = "emmc_rig/model/reading.py", "drivers/raw.py"
-CHILD, TIFF, PICTURES = (
-    f"emmc_rig/model/decoding/{name}.py" for name in ("child", "tiff", "pictures")
-)
-GUARDED = {
-    "yaml": (READING, "emmc_rig/formats/yaml_edit.py"),  # whose text was parsed there before
-    "json.load": ("emmc_rig/model/json_text.py",),
-    "h5py.File": (READING,),
-    "cv2.im": (PICTURES, "emmc_rig/study/stability/sensor_faults.py"),  # faults: its own bytes
-    "PIL.Image.open": (PICTURES,),
-    "rawpy": (RAW,),
-    "tifffile": (RAW, "drivers/dng.py", TIFF),  # drivers/dng.py: its own bytes
-    "scipy.io": (CHILD,),
-    "OpenEXR": (CHILD,),
-    "zarr": ("emmc_rig/store/shards.py",),
-    # What a study and a film keep for themselves.
-    "numpy.load": ("emmc_rig/process/filming.py", CHILD),
-    "torch.load": (),
-    "pickle.load": (),
-    "imagecodecs": (),  # which tifffile calls
-    "imageio": (),
-}
-"""By decoder, the modules that may call it."""
-DECODERS = {
-    **{f"yaml.{name}": "yaml" for name in
-       ("load", "load_all", "safe_load", "safe_load_all", "full_load", "unsafe_load", "compose",
-        "parse", "scan")},
-    **{f"json.{name}": "json.load" for name in ("load", "loads", "JSONDecoder")},
-    "h5py.File": "h5py.File",
-    **{f"cv2.{name}": "cv2.im" for name in
-       ("imdecode", "imread", "imreadmulti", "imdecodemulti", "imdecodeanimation",
-        "imreadanimation")},
-    "PIL.Image.open": "PIL.Image.open",
-    "PIL.Image.Exif": "PIL.Image.open",
-    **{f"rawpy.{name}": "rawpy" for name in ("imread", "RawPy")},
-    **{f"tifffile.{name}": "tifffile" for name in ("imread", "TiffFile", "memmap")},
-    "scipy.io.loadmat": "scipy.io",
-    "OpenEXR.File": "OpenEXR",
-    **{f"zarr.{name}": "zarr" for name in ("open", "open_group", "open_array", "load")},
-    "numpy.load": "numpy.load",
-    "torch.load": "torch.load",
-    **{f"imagecodecs.{name}": "imagecodecs" for name in ("imread", "tiff_decode", "png_decode")},
-    **{f"{name}.{read}": "imageio" for name in ("imageio", "imageio.v2", "imageio.v3")
-       for read in ("imread", "mimread", "volread", "imopen", "get_reader")},
-    **{f"pickle.{name}": "pickle.load" for name in ("load", "loads", "Unpickler")},
-}  # fmt: skip
+READING = ROOT / "emmc_rig/model/reading.py"
 
 
-def decoder_calls(source):
-    """(line, full name) of a module's uses of decoders, also under other names by import."""
-    tree = ast.parse(source)
-    names = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            for entry in node.names:
-                names[entry.asname or entry.name.split(".")[0]] = (
-                    entry.name if entry.asname else entry.name.split(".")[0]
-                )
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            for entry in node.names:
-                names[entry.asname or entry.name] = f"{node.module}.{entry.name}"
-
-    def full(node):
-        if isinstance(node, ast.Name):
-            return names.get(node.id, "")
-        if isinstance(node, ast.Attribute):
-            return f"{full(node.value)}.{node.attr}"
-        return ""
-
-    harmless = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call):
-            first = node.args[0] if node.args else None
-            if full(node.func) == "json.loads" and isinstance(first, ast.Call):
-                if full(first.func) == "json.dumps":
-                    harmless.add(node.func)
-            elif full(node.func) == "h5py.File" and [
-                entry.value for entry in node.args[1:2] if isinstance(entry, ast.Constant)
-            ] == ["w"]:
-                harmless.add(node.func)
-        for part in ("annotation", "returns"):
-            if isinstance(note := getattr(node, part, None), ast.expr):
-                harmless.update(ast.walk(note))
-    return [
-        (node.lineno, full(node))
-        for node in ast.walk(tree)
-        if isinstance(node, (ast.Attribute, ast.Name))
-        and full(node) in DECODERS
-        and node not in harmless
-    ]
-
-
-@pytest.mark.slow
-def test_no_module_but_the_guarded_ones_calls_a_decoder():
-    found = []
+def test_hdf5_is_opened_for_reading_in_one_place():
+    """Ruff keeps other decoders to their modules, but cannot tell reading from writing."""
+    opened = re.compile(r"h5py\.File\((?![^()]*(\([^()]*\)[^()]*)*\"w\")")
     for package in ("emmc_rig", "drivers", "calibration", "reconstruction", "simulators"):
-        for path in sorted((ROOT / package).rglob("*.py")):
-            name = path.relative_to(ROOT).as_posix()
-            for line, decoder in decoder_calls(path.read_text(encoding="utf-8")):
-                if name not in GUARDED[DECODERS[decoder]]:
-                    found.append(f"{name}:{line} {decoder}")
-    assert not found
-
-
-@pytest.mark.parametrize(
-    ("source", "calls"),
-    [
-        ("import yaml\nyaml.safe_load(x)", ["yaml.safe_load"]),
-        ("from yaml import safe_load as read\nread(x)", ["yaml.safe_load"]),
-        ("import json as j\nread = j.loads", ["json.loads"]),
-        ("import json\njson.loads(json.dumps(x))", []),
-        ("import h5py as h\nh.File(x, 'w')\nh.File(x)\nh.File(x, 'r+')", ["h5py.File"] * 2),
-        ("import h5py\ndef f(x: h5py.File) -> h5py.File: ...", []),
-        ("def f():\n    from rawpy import imread\n    return imread(x)", ["rawpy.imread"]),
-        ("import scipy.io\nscipy.io.loadmat(x)", ["scipy.io.loadmat"]),
-    ],
-)  # fmt: skip
-def test_a_decoder_is_recognised_by_whatever_name_it_is_called(source, calls):
-    assert [name for _, name in decoder_calls(source)] == calls
+        for path in sorted(set((ROOT / package).rglob("*.py")) - {READING}):
+            assert not opened.search(path.read_text(encoding="utf-8")), path
 
 
 # Memory and time, each measured in a process of its own
@@ -196,25 +87,16 @@ SETTINGS = "from emmc_rig.model.reading import read_yaml", "read_yaml(path, Valu
 SCENE = "from emmc_rig.formats.scenes import open_scene", "open_scene(str(path))"
 
 
-def png(columns, rows, depth, kind, interlace, data, damage=0):
-    def chunk(name, content):
-        body = name + content
-        checksum = zlib.crc32(body) ^ (damage if name == b"IHDR" else 0)
-        return struct.pack(">I", len(content)) + body + struct.pack(">I", checksum)
-
-    header = struct.pack(">IIBBBBB", columns, rows, depth, kind, 0, 0, interlace)
-    palette = chunk(b"PLTE", bytes(6)) if kind == 3 else b""
-    parts = chunk(b"IHDR", header) + palette + chunk(b"IDAT", zlib.compress(data))
-    return b"\x89PNG\r\n\x1a\n" + parts + chunk(b"IEND", b"")
-
-
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        (png(600, 447_392, 1, 3, 1, bytes(1_800_000)), "pixels, more than 1842 bytes can hold"),
-        (png(16_384, 16_384, 255, 2, 0, bytes(1_800_000)), "255 bits a sample of colour type 2"),
-        (png(16_384, 16_384, 8, 5, 0, bytes(1_800_000)), "8 bits a sample of colour type 5"),
-        (png(8, 8, 8, 2, 0, bytes(200), damage=1), "cut short or damaged"),
+        (
+            png(600, 447_392, 1, 3, bytes(1_800_000), interlace=1),
+            "pixels, more than 1842 bytes can hold",
+        ),
+        (png(16_384, 16_384, 255, 2, bytes(1_800_000)), "255 bits a sample of colour type 2"),
+        (png(16_384, 16_384, 8, 5, bytes(1_800_000)), "8 bits a sample of colour type 5"),
+        (png(8, 8, 8, 2, bytes(200), damage=1), "cut short or damaged"),
     ],
     ids=["unpacks to too much", "depth", "colour type", "checksum"],
 )
@@ -295,14 +177,6 @@ def test_a_filter_that_allocates_what_the_file_says_is_refused(tmp_path, packing
     assert "packed in another way than by gzip or lzf, once; copy it again" in said.replace(")", "")
 
 
-def test_samples_that_are_no_light_are_counted_in_little_memory(tmp_path):
-    with h5py.File(tmp_path / "scene.h5", "w") as file:
-        file["light_field"] = np.full((2, 2, 1000, 1300, 3), 7, np.float32)
-    said, megabytes, _ = watched(*HDF5, tmp_path / "scene.h5")
-    assert "15600000 samples are not in [0, 1], the first 7 at view (0, 0), y 0, x 0" in said
-    assert megabytes < 250
-
-
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -318,14 +192,6 @@ def test_settings_that_are_no_settings_are_refused_at_once(tmp_path, text, compl
     said, megabytes, seconds = watched(*SETTINGS, path)
     assert complaint in said
     assert (megabytes < 60, seconds < 2) == (True, True), (megabytes, seconds)
-
-
-@pytest.mark.slow
-def test_the_largest_file_of_settings_takes_moderate_memory(tmp_path):
-    path = tmp_path / "mask.yaml"
-    path.write_text("[" + "1," * 499_000 + "1]")
-    said, megabytes, _ = watched(*SETTINGS, path)
-    assert (said, megabytes < 300) == ("", True), megabytes
 
 
 def tiff(rows, columns):
@@ -385,22 +251,13 @@ def test_a_zarr_group_without_its_shards_is_not_read_whole(tmp_path):
 @pytest.mark.parametrize("ending", ["png", "tif"])
 def test_a_view_whose_name_holds_another_number_is_named_at_once(tmp_path, ending):
     for name in ("view_0_0", "view_0_1", "view_99999_99999"):
-        (tmp_path / f"{name}.{ending}").write_bytes(png(2, 2, 8, 2, 0, bytes(14)))
+        (tmp_path / f"{name}.{ending}").write_bytes(png(2, 2, 8, 2, bytes(14)))
     said, megabytes, seconds = watched(*SCENE, tmp_path)
     assert (
         f"3 views do not fill 100000x100000, as view_99999_99999.{ending} asks for; names are "
         "view_ROW_COL, rows and columns counted from 0: rename it or move it away"
     ) in said
     assert (megabytes < 300, seconds < 10) == (True, True), (megabytes, seconds)
-
-
-@pytest.mark.slow
-def test_a_folder_of_hci_that_claims_many_views_is_refused_at_once(tmp_path):
-    (tmp_path / "input_Cam000.png").write_bytes(png(2, 2, 8, 2, 0, bytes(14)))
-    (tmp_path / "parameters.cfg").write_text("[extrinsics]\nnum_cams_x=99999\nnum_cams_y=999\n")
-    said, megabytes, _ = watched(*SCENE, tmp_path)
-    assert "1 files input_Cam###.png, but parameters.cfg says 999x99999" in said
-    assert megabytes < 300
 
 
 # Specifications of devices
@@ -458,16 +315,6 @@ def test_a_psi_whose_camera_is_no_text_any_more_is_damaged(tmp_path):
     for read in (lambda: Psi.load(path), StoredPsi(path).verify, StoredPsi(path).load):
         with pytest.raises(SensingError, match=r"psi\.h5: damaged \(its checksum differs\)"):
             read()
-
-
-def test_a_psi_in_shards_whose_camera_is_no_text_any_more_is_damaged(tmp_path):
-    pytest.importorskip("zarr", reason="needs the extra `zarr`")
-    psi = build_imaging_matrix(find_camera("rgbw-bayer-1shot"), (16, 16))
-    save_shards(psi, tmp_path / "psi.zarr")
-    about = tmp_path / "psi.zarr/zarr.json"
-    about.write_text(about.read_text().replace('\\"title', "\\ud800title", 1))
-    with pytest.raises(SensingError, match=r"damaged \(its checksum differs\)"):
-        StoredPsi(tmp_path / "psi.zarr").verify()
 
 
 @pytest.mark.parametrize("change", [{"binning": 0}, {"weights": (2, 3)}])

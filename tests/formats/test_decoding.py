@@ -414,12 +414,6 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, monkeypatch, name, kind):
             door(path)
 
 
-def test_a_link_to_a_file_is_that_file(tmp_path):
-    np.save(tmp_path / "a.npy", STACK)
-    (tmp_path / "b.npy").symlink_to("a.npy")
-    assert np.array_equal(read_own(tmp_path / "b.npy").frames, STACK)
-
-
 FOREIGN = {
     "a FITS file": b"SIMPLE  =                    T",
     "a HEIC picture": b"\0\0\0\x18ftypheic\0\0\0\0",

@@ -6,7 +6,7 @@ from view_files import save_views
 
 from emmc_rig.formats.scenes import box_average, fine_scene, open_scene
 from emmc_rig.model.errors import ModelError
-from emmc_rig.model.lightfield import psnr_db, save_hdf5
+from emmc_rig.model.lightfield import save_hdf5
 from emmc_rig.simulators.scenes import SCENES, render
 
 
@@ -83,18 +83,6 @@ def test_the_truth_of_a_fine_built_in_scene_is_its_box_average():
     assert (fine.aperture_factor, fine.pixel_factor) == (2, 3)
     expected = fine.samples.reshape(2, 2, 3, 2, 24, 3, 32, 3, 3).mean(axis=(1, 3, 5, 7))
     np.testing.assert_allclose(fine.scene.light_field, expected, atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "aperture_factor", "at_least_db"),
-    [("near-planar", 2, 40), ("deep-occlusions", 1, 35)],
-)
-def test_the_box_average_is_nearly_the_scene_rendered_coarsely(name, aperture_factor, at_least_db):
-    """Not equal: a coarse view is a pinhole's, the average is over its aperture cell."""
-    fine = fine_scene(name, aperture_factor, 2, (192, 256), views=(2, 2))
-    coarse = open_scene(name, (192, 256), views=(2, 2))
-    assert psnr_db(coarse.light_field, fine.scene.light_field) > at_least_db
 
 
 @pytest.mark.parametrize("pixel_factor", [1, 2, 3])

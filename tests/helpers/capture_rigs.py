@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from watching import Acting
 
+from emmc_rig.bench.hands import Attendant
 from emmc_rig.bench.hardware import Rig
 from emmc_rig.captures.plan import Plan, planned_camera
 from emmc_rig.captures.run import CaptureRequest, new_session, planned_frames
@@ -82,7 +83,7 @@ class PreparedCamera:
         pass
 
 
-class QuietAttendant:
+class QuietAttendant(Attendant):
     """Carries out requests at once, and keeps their list."""
 
     def __init__(self):

@@ -30,12 +30,6 @@ def test_every_row_is_worked_on_once(rows, bands):
     assert (rows_done(rows, bands)[0] == 1).all()
 
 
-def test_threads_are_kept_between_calls():
-    threads = set().union(*(rows_done(8)[1] for _ in range(50)))
-    assert len(threads) <= get_num_threads()
-    assert threading.get_ident() not in threads
-
-
 def test_a_call_within_a_band_runs_in_its_thread():
     inner = []
     in_bands(lambda *_: inner.append((threading.get_ident(), rows_done(5, 4)[1])), 6, 6)

@@ -10,7 +10,6 @@ import yaml
 from emmc_rig.model.camera import (
     Camera,
     build_imaging_matrix,
-    draw_plates,
     load_camera,
     pixel_light,
     psi_layout,
@@ -80,14 +79,9 @@ def test_a_valid_description_is_read(tmp_path):
     ("path", "key", "near"),
     [
         ((), "titel", "title"),
-        ((), "total_exposure", "total_exposure_s"),
-        (("lens",), "distance_cm", "distance_mm"),
-        (("sensor",), "bining", "binning"),
         (("sensor", "noise"), "read_noise_electron", "read_noise_electrons"),
-        (("masks", "near"), "cell_mm", "cell_um"),
         (("masks", "near", "pattern"), "open_probabilty", "open_probability"),
         (("masks", "far", "pattern"), "scann", "scan"),
-        (("shots", 1), "exposure_ms", "exposure_s"),
         (("shots", 0), "offsets_um", "offset_um"),
     ],
 )
@@ -95,14 +89,6 @@ def test_a_misspelt_key_is_an_error_that_names_the_nearest_valid_one(tmp_path, p
     message = refusal(tmp_path, changed(*path, key, 1))
     assert message.endswith(f"did you mean '{near}'?")
     assert key in message
-
-
-def test_a_key_like_no_other_is_answered_with_the_valid_ones(tmp_path):
-    message = refusal(tmp_path, changed("lens", "xyzzy", 1))
-    assert message == (
-        "unknown key 'lens.xyzzy': valid keys: aperture_cell_mm, aperture_fill, distance_mm, "
-        "focus_mm, pupil"
-    )
 
 
 def test_a_key_of_another_pattern_is_not_offered(tmp_path):
@@ -115,21 +101,15 @@ def test_a_key_of_another_pattern_is_not_offered(tmp_path):
     [
         (("lens", "distance_mm"), float("nan"), "lens.distance_mm: input should be a finite"),
         (("shots", 0, "offset_um", "near"), [float("nan"), 0], "finite"),
-        (("lens", "distance_mm"), 0, "greater than 0"),
         (("lens", "distance_mm"), "far", "lens.distance_mm: input should be a number"),
-        (("masks", "near", "distance_mm"), -1, "masks.near.distance_mm: input should be greater"),
-        (("masks",), [1, 2], "masks: input should be a mapping"),
         (("views",), [0, 3], "'views' needs at least one row and one column"),
         (("views",), [2.5, 3], "views.0: input should be a whole number"),
-        (("shots",), [], "at least 1 item"),
         (("shots", 0, "filter"), "violet", "shots.0.filter: input should be 'none', 'red'"),
         (("sensor", "cfa"), "rgbx", "sensor: unknown CFA 'rgbx': use one of mono, rggb"),
-        (("sensor", "cfa"), ["RG", "B"], "sensor: CFA tile"),
         (("sensor", "noise", "black_level_dn"), 65535, "black_level_dn must be below"),
         (("masks", "near", "pattern"), {"kind": "lace"}, "'open'"),
         (("masks", "near", "pattern"), {"kind": "mura", "prime": 9}, "9 is not prime"),
         (("masks", "near", "pattern"), {"kind": "tile", "cells": [[2]]}, "must lie in [0, 1]"),
-        (("masks", "near", "pattern"), {"kind": "tile", "cells": [[{}]]}, "not numbers"),
     ],
 )
 def test_a_value_that_cannot_be_is_refused(tmp_path, path, value, complaint):
@@ -161,39 +141,8 @@ def test_a_mask_that_is_not_described_cannot_be_used(tmp_path, path, value, wher
     assert message.endswith("which is not among: near, far")
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("", "holds nothing, where settings"),
-        ("- a\n- b\n", "holds a list, where settings"),
-        ("title: [open\n", "not valid YAML at line"),
-        ("title: a\nborn: 2001-13-45\n", "not valid YAML"),
-    ],
-)
-def test_a_file_that_is_no_description_is_refused(tmp_path, text, complaint):
-    path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    with pytest.raises(CameraError, match=complaint) as fault:
-        load_camera(path)
-    assert "\n" not in str(fault.value)
-
-
-def test_a_file_that_cannot_be_read_is_refused(tmp_path):
-    with pytest.raises(CameraError, match="no such file"):
-        load_camera(tmp_path / "missing.yaml")
-    with pytest.raises(CameraError, match="a folder, where a file is meant"):
-        load_camera(tmp_path)
-    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(CameraError, match="not text in UTF-8"):
-        load_camera(tmp_path / "binary.yaml")
-
-
 def offsets(camera, name="near"):
     return [shot.offset_um.get(name) for shot in camera.shots]
-
-
-def test_fewer_shots_are_the_first_ones():
-    assert offsets(Camera.model_validate(VALID).with_shots(1)) == [(0, 0)]
 
 
 def test_more_shots_are_further_rounds_moved_by_the_step():
@@ -268,11 +217,6 @@ def test_a_picture_smaller_than_the_beam_is_refused_unless_it_repeats(tmp_path):
     one_mask(mask | {"pattern": pattern | {"repeat": True}})
 
 
-def test_a_drawn_mask_is_made_large_enough_for_every_offset():
-    mask = {"distance_mm": 0.3, "cell_um": 24.0, "pattern": {"kind": "random_rgbw"}}
-    one_mask(mask, shots=[{"offset_um": {"m": [5000, -3000]}}])
-
-
 def test_a_mask_in_contact_has_its_cells_on_the_samples():
     mask = {"distance_mm": 0.0, "cell_um": 24.0, "pattern": {"kind": "random_binary"}}
     for size in [(6, 6), (7, 9), (8, 5)]:
@@ -332,20 +276,6 @@ def test_a_pixel_collects_light_in_proportion_to_its_colours_and_samples(binning
     for shot, pair in enumerate([(1, 3), (1, 1), (0, 1)]):
         expected = np.resize(np.array(pair) * binning**2, light.shape[1:])
         np.testing.assert_array_equal(light[shot], expected)
-
-
-def test_a_redrawn_mask_has_as_many_plates_as_shots():
-    pattern = {"kind": "random_rgbw", "redraw": True}
-    mask = {"distance_mm": 0.0, "cell_um": 24.0, "pattern": pattern}
-    described = Camera.model_validate({"title": "t", "masks": {"m": mask}, "shots": [{}] * 3})
-    assert draw_plates(described, (6, 6))["m"].cells.shape[0] == 3
-
-
-def test_a_mask_in_the_lens_casts_no_shadow_that_diffraction_could_blur():
-    mask = {"distance_mm": 50, "cell_um": 24, "pattern": {"kind": "open"}}
-    described = {"title": "t", "masks": {"m": mask}}
-    assert Camera.model_validate(described).lens.distance_mm == mask["distance_mm"]
-    assert Camera.model_validate(described).warnings() == []
 
 
 def test_a_mask_whose_shadow_diffraction_blurs_is_warned_about():

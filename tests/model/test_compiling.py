@@ -15,8 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numba.core.compiler import Flags
-from numba.core.targetconfig import TargetConfig
 
 from emmc_rig.model import compiling
 
@@ -92,33 +90,6 @@ def test_a_helper_changed_in_another_file_changes_what_kernels_compute(copied, m
     assert after == anew != before
 
 
-def test_a_constant_changed_in_a_file_imported_through_others_changes_the_state(tmp_path):
-    package = tmp_path / "plugin"
-    package.mkdir()
-    for name, text in {
-        "__init__": "",
-        "kernels": "from plugin import rules\nfrom plugin.other import (\n    ONE,\n)\n",
-        "rules": "import plugin.level\n",
-        "other": "from .level import ONE\nfrom emmc_rig.model import bands\n",
-        "level": "ONE = 1\n",
-        "beside": "ONE = 1\n",
-    }.items():
-        (package / f"{name}.py").write_text(text)
-
-    def state():
-        compiling._read.cache_clear()
-        return compiling._state(package / "kernels.py")
-
-    before = state()
-    assert before[0] == "plugin.kernels"
-    (package / "beside.py").write_text("ONE = 2\n")
-    assert state() == before
-    (package / "level.py").write_text("ONE = 2\n")
-    assert state() != before
-    imported = compiling._read(package / "other.py", tmp_path)[1]
-    assert Path(compiling.__file__).with_name("bands.py") in imported
-
-
 @pytest.mark.slow
 def test_where_the_folder_beside_the_source_is_not_writable_the_users_keeps_the_code(copied):
     blocked = copied / "emmc_rig/reconstruction/adaptive/__pycache__"
@@ -127,31 +98,6 @@ def test_where_the_folder_beside_the_source_is_not_writable_the_users_keeps_the_
     before, _, folder = run(copied)
     assert copied.parent / "home" in folder.parents
     assert run(copied)[:2] == (before, 1)
-
-
-def test_whether_machine_code_is_kept_is_known(tmp_path, monkeypatch):
-    file = tmp_path / "kernels.py"
-    file.write_text("ONE = 1\n")
-    monkeypatch.setattr(compiling._numba, "CACHE_DIR", "")
-    assert compiling.is_kept(str(file))
-    (tmp_path / "__pycache__" / "kernels").rename(tmp_path / "before")
-    (tmp_path / "__pycache__" / "kernels").write_text("no folder")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
-    compiling._folder.cache_clear()
-    assert not compiling.is_kept(str(file))
-
-
-def test_code_that_no_process_used_for_a_month_is_removed(tmp_path):
-    file = tmp_path / "kernels.py"
-    file.write_text("ONE = 1\n")
-    for name, days in (("old", 31), ("recent", 29)):
-        folder = tmp_path / "__pycache__" / "kernels" / name
-        folder.mkdir(parents=True)
-        then = time.time() - days * 86400
-        os.utime(folder, (then, then))
-    mine = compiling._folder(file, "")
-    assert mine is not None
-    assert {path.name for path in mine.parent.iterdir()} == {"recent", mine.name}
 
 
 def test_every_kernel_whose_file_imports_others_of_the_project_is_compiled_with_its_sources():
@@ -284,22 +230,6 @@ def test_what_is_compiled_into_kernels_alone_says_so_when_it_is_called(own_kerne
     assert own_kernel.half.py_func(1.0) == 0.5
 
 
-def test_flags_are_equal_where_numba_calls_them_equal():
-    def flags(**options):
-        made = Flags()
-        for name, value in options.items():
-            setattr(made, name, value)
-        return made
-
-    every = [flags(), flags(nrt=False), flags(nrt=True), flags(nrt=True, forceinline=True)]
-    for first in every:
-        assert hash(first) == TargetConfig.__hash__(first)
-        assert first != "flags"
-        for second in every:
-            assert (first == second) is TargetConfig.__eq__(first, second)
-    assert every[0] == every[1]
-
-
 @pytest.mark.slow
 def test_the_process_that_compiles_computes_what_later_ones_load(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
@@ -324,20 +254,14 @@ def test_the_clock_stands_still_while_a_kernel_is_compiled():
     assert compiling.compiling_s() == before
 
 
-def test_kernels_compiled_by_two_threads_count_once():
-    barrier, meter = threading.Barrier(2), compiling._Meter()
-
-    def work():
-        with meter():
-            barrier.wait()
-            with meter():  # what a kernel compiles within itself
-                time.sleep(0.05)
-            barrier.wait()
-
-    threads = [threading.Thread(target=work) for _ in range(2)]
-    started = time.perf_counter()
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert 0.05 <= meter.read()[1] <= time.perf_counter() - started
+def test_code_that_no_process_used_for_a_month_is_removed(tmp_path):
+    file = tmp_path / "kernels.py"
+    file.write_text("ONE = 1\n")
+    for name, days in (("old", 31), ("recent", 29)):
+        folder = tmp_path / "__pycache__" / "kernels" / name
+        folder.mkdir(parents=True)
+        then = time.time() - days * 86400
+        os.utime(folder, (then, then))
+    mine = compiling._folder(file, "")
+    assert mine is not None
+    assert {path.name for path in mine.parent.iterdir()} == {"recent", mine.name}

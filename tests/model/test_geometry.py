@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from emmc_rig.model.camera import Camera, build_imaging_matrix
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.geometry import (
     CellWeights,
@@ -15,36 +14,6 @@ from emmc_rig.model.geometry import (
 )
 
 LENS_MM = 50.0
-APERTURE_CELL_MM = 5.0
-PITCH_UM = 24.0
-
-
-def camera(distance_mm, cell_um, pattern, views=(3, 3), aperture_fill=1.0, pixel_fill=1.0):
-    return Camera.model_validate(
-        {
-            "title": "one mask",
-            "views": views,
-            "lens": {
-                "distance_mm": LENS_MM,
-                "aperture_cell_mm": APERTURE_CELL_MM,
-                "aperture_fill": aperture_fill,
-            },
-            "sensor": {"sample_pitch_um": PITCH_UM, "pixel_fill": pixel_fill},
-            "masks": {"m": {"distance_mm": distance_mm, "cell_um": cell_um, "pattern": pattern}},
-        }
-    )
-
-
-def transmittance(described, size):
-    """Return what every view's rays pass, (v, u, y, x), of a monochrome camera with grey masks."""
-    psi = build_imaging_matrix(described, size)
-    views_v, views_u = described.views
-    return psi.weights[0].sum(axis=-2) * views_v * views_u
-
-
-def grey_cells(line, rows):
-    """Return a mask of `rows` equal rows of cells."""
-    return {"kind": "parameters", "cells": [[float(value) for value in line]] * rows}
 
 
 def traced_weights(x_um, u_um, pixel_um, aperture_um, distance_um, lens_um, cell_um, cells, rays):
@@ -65,101 +34,6 @@ def test_a_grid_is_centred_and_equally_spaced():
     np.testing.assert_allclose(centred_grid(4, 2.0), [-3, -1, 1, 3])
     np.testing.assert_allclose(centred_grid(3, 5.0), [-5, 0, 5])
     np.testing.assert_allclose(centred_grid(1, 7.0), [0])
-
-
-@pytest.mark.parametrize("distance", [0.0, 0.3, 25.0, 50.0])
-def test_a_ray_meets_the_mask_on_the_straight_line_from_sensor_to_lens(distance):
-    x, u = np.meshgrid(centred_grid(5, 0.7), centred_grid(4, 3.0))
-    slope = (u - x) / LENS_MM
-    np.testing.assert_allclose(
-        mask_position(x, u, distance, LENS_MM), x + slope * distance, atol=1e-12
-    )
-
-
-def test_every_view_sees_the_same_of_a_mask_in_contact():
-    seen = transmittance(camera(0.0, PITCH_UM, {"kind": "random_binary", "seed": 3}), (8, 10))
-    assert set(np.unique(seen.round(6))) == {0.0, 1.0}
-    np.testing.assert_allclose(seen, np.broadcast_to(seen[:1, :1], seen.shape), atol=1e-6)
-
-
-def test_a_view_sees_one_value_of_a_mask_at_the_lens():
-    cells = np.arange(1, 10).reshape(3, 3) / 10
-    pattern = {"kind": "parameters", "cells": cells.tolist()}
-    seen = transmittance(camera(LENS_MM, APERTURE_CELL_MM * 1e3, pattern), (6, 8))
-    np.testing.assert_allclose(seen, np.broadcast_to(cells[:, :, None, None], seen.shape), 1e-6)
-
-
-@pytest.mark.parametrize("distance_mm", [0.24, 2.0, 20.0])
-def test_the_penumbra_of_an_edge_is_as_wide_as_the_aperture_seen_from_the_mask(distance_mm):
-    ratio = distance_mm / LENS_MM
-    described = camera(distance_mm, 1e5, grey_cells([0, 1], 2), pixel_fill=0.0)
-    seen = transmittance(described, (1, 300))
-    width_um = ratio * APERTURE_CELL_MM * 1e3
-    for u, lens_um in enumerate(centred_grid(3, APERTURE_CELL_MM * 1e3)):
-        met_um = (1 - ratio) * centred_grid(300, PITCH_UM) + ratio * lens_um
-        np.testing.assert_allclose(seen[0, u, 0], np.clip(met_um / width_um + 0.5, 0, 1), atol=1e-6)
-        inside = (seen[0, u, 0] > 1e-6) & (seen[0, u, 0] < 1 - 1e-6)
-        on_sensor_um = min(width_um / (1 - ratio), 300 * PITCH_UM)
-        shadow_um = np.count_nonzero(inside) * PITCH_UM
-        assert shadow_um <= on_sensor_um + PITCH_UM
-
-
-def test_the_edge_of_a_shadow_moves_from_view_to_view_by_the_magnified_share_of_the_lens_step():
-    ratio = 0.1
-    described = camera(
-        ratio * LENS_MM, 1e5, grey_cells([0, 1], 2), aperture_fill=0.0, pixel_fill=0.0
-    )
-    seen = transmittance(described, (1, 200))
-    x_um = centred_grid(200, PITCH_UM)
-    for u, lens_um in enumerate(centred_grid(3, APERTURE_CELL_MM * 1e3)):
-        edge_um = -ratio * lens_um / (1 - ratio)
-        np.testing.assert_array_equal(seen[0, u, 0].round(6), x_um > edge_um)
-
-
-@pytest.mark.parametrize("distance_mm", [0.5, 5.0, 23.0])
-def test_a_point_source_in_the_lens_magnifies_the_shadow_of_a_cell(distance_mm):
-    ratio = distance_mm / LENS_MM
-    cell_um = 600.0
-    line = np.ones(101)
-    line[52] = 0
-    described = camera(
-        distance_mm, cell_um, grey_cells(line, 101), aperture_fill=0.0, pixel_fill=0.0
-    )
-    seen = transmittance(described, (1, 601))
-    x_um = centred_grid(601, PITCH_UM)
-    for u, lens_um in enumerate(centred_grid(3, APERTURE_CELL_MM * 1e3)):
-        left_um = (1.5 * cell_um - ratio * lens_um) / (1 - ratio)
-        right_um = (2.5 * cell_um - ratio * lens_um) / (1 - ratio)
-        assert right_um - left_um == pytest.approx(cell_um / (1 - ratio))
-        shadow = (x_um > left_um) & (x_um < right_um)
-        assert shadow.any()
-        np.testing.assert_array_equal(seen[0, u, 0].round(6), ~shadow)
-
-
-def test_a_mask_of_magnified_cells_shows_one_cell_to_one_sample_shifted_by_whole_cells():
-    ratio = 0.2
-    cell_um = (1 - ratio) * PITCH_UM
-    lens_step_um = cell_um / ratio
-    x_um = centred_grid(9, PITCH_UM)
-    for step in (-2, 0, 1):
-        met_um = mask_position(x_um, step * lens_step_um, ratio, 1.0)
-        weights = cell_weights(met_um, Footprint(cell_um, 0.0), cell_um, 13).toarray()
-        expected = np.zeros((9, 13))
-        expected[np.arange(9), np.arange(9) + 2 + step] = 1
-        np.testing.assert_allclose(weights, expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("cell_um", [5.0, 19.0, 80.0])
-@pytest.mark.parametrize(
-    ("pixel_um", "aperture_um"),
-    [(0, 0), (24, 0), (0, 24), (17, 31), (31, 17), (24, 24), (24, 1e-6)],
-)
-def test_the_weights_of_every_footprint_sum_to_one(cell_um, pixel_um, aperture_um):
-    positions_um = np.concatenate([centred_grid(40, 7.3), [-cell_um, -cell_um / 2, 0.0, cell_um]])
-    count = int(np.ceil(400 / cell_um))
-    weights = cell_weights(positions_um, Footprint(pixel_um, aperture_um), cell_um, count).toarray()
-    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
-    assert weights.min() >= 0
 
 
 @pytest.mark.parametrize("cell_um", [7.0, 24.0, 65.0])

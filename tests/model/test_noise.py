@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from scipy.stats import chi2
 
 from emmc_rig.model.noise import SensorNoise
@@ -56,16 +55,6 @@ def test_a_dark_frame_holds_read_and_quantisation_noise_around_the_black_level(r
         assert_moments(dn.astype(float), 500, 0.8**2 * read_noise**2 + 1 / 12)
 
 
-def test_quantisation_alone_has_a_variance_of_a_twelfth_and_no_bias():
-    sensor = SensorNoise(electrons_per_s=1000, gain_dn_per_electron=1.0)
-    readings = np.random.default_rng(2).uniform(0.2, 0.8, COUNT)
-    dn = sensor.expose_dn(readings, 1.0, 1.0, Silent())  # type: ignore[arg-type]
-    error = dn - sensor.black_level_dn - 1000 * readings
-    assert np.abs(error).max() <= 0.5
-    assert abs(error.mean()) < 4.42 * np.sqrt(1 / 12 / COUNT)
-    assert error.var() == pytest.approx(1 / 12, rel=4.42 * np.sqrt(0.8 / COUNT))
-
-
 def test_without_chance_normalise_inverts_expose_to_half_a_digital_number():
     sensor = SensorNoise(electrons_per_s=240_000)
     readings = np.linspace(0, 1, 1001)
@@ -88,20 +77,6 @@ def test_the_sensor_clips_at_its_white_level_and_says_where():
     assert full.expose_dn(np.ones(9), 1.0, 1.0, rng).tolist() == [65_535] * 9
 
 
-def test_the_sensor_clips_at_zero_below_the_black_level():
-    sensor = SensorNoise(black_level_dn=0, read_noise_electrons=10)
-    dn = sensor.expose_dn(np.zeros(COUNT), EXPOSURE_S, 1.0, np.random.default_rng(4))
-    assert dn.max() < 100
-    assert (dn == 0).mean() == pytest.approx(0.5, abs=0.05)
-
-
-def test_more_light_and_longer_exposures_reduce_the_variance_of_a_reading_as_photons_do():
-    sensor = SensorNoise(read_noise_electrons=0, gain_dn_per_electron=1000.0)
-    once = sensor.variance(np.array(0.5), EXPOSURE_S, 1.0)
-    assert sensor.variance(np.array(0.5), EXPOSURE_S, 3.0) == pytest.approx(once / 3, rel=1e-6)
-    assert sensor.variance(np.array(0.5), 4 * EXPOSURE_S, 1.0) == pytest.approx(once / 4, rel=1e-6)
-
-
 def test_light_and_exposure_may_differ_from_pixel_to_pixel_and_shot_to_shot():
     sensor = SensorNoise(electrons_per_s=240_000)
     light = np.array([[1.0, 3.0], [2.0, 1.0]])
@@ -112,13 +87,6 @@ def test_light_and_exposure_may_differ_from_pixel_to_pixel_and_shot_to_shot():
     dn = sensor.expose_dn(readings, exposure_s, light, np.random.default_rng(5))
     sigma = np.sqrt(sensor.variance(readings, exposure_s, light))
     assert (np.abs(sensor.normalise(dn, exposure_s, light) - readings) < 5 * sigma).all()
-
-
-def test_the_variance_of_a_reading_below_black_is_that_of_a_dark_one():
-    sensor = SensorNoise()
-    assert sensor.variance(np.array(-0.1), EXPOSURE_S, 1.0) == sensor.variance(
-        np.array(0.0), EXPOSURE_S, 1.0
-    )
 
 
 def test_a_pixel_that_no_light_reaches_reads_0_and_has_no_weight():
@@ -132,13 +100,8 @@ def test_a_pixel_that_no_light_reaches_reads_0_and_has_no_weight():
     assert variance[1] == np.inf
 
 
-def test_the_same_seed_exposes_the_same_frame():
-    sensor = SensorNoise()
-    first, second = (exposed(sensor, 0.5, seed=7, count=100) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-    assert (exposed(sensor, 0.5, seed=8, count=100) != first).any()
-
-
-def test_a_black_level_above_the_white_level_is_refused():
-    with pytest.raises(ValidationError, match="must be below"):
-        SensorNoise(black_level_dn=4095, white_level_dn=4095)
+def test_the_sensor_clips_at_zero_below_the_black_level():
+    sensor = SensorNoise(black_level_dn=0, read_noise_electrons=10)
+    dn = sensor.expose_dn(np.zeros(COUNT), EXPOSURE_S, 1.0, np.random.default_rng(4))
+    assert dn.max() < 100
+    assert (dn == 0).mean() == pytest.approx(0.5, abs=0.05)

@@ -110,19 +110,3 @@ def test_a_disparity_of_the_centre_view_is_taken_and_any_other_estimated(scene):
     for other in (None, given[::2, ::2]):
         made = centre_disparity(light_field, other)
         np.testing.assert_array_equal(made, estimated_disparity(light_field))
-
-
-def test_a_plane_s_disparity_is_estimated():
-    light_field = np.array(
-        [
-            [
-                waves(
-                    *np.mgrid[: SIZE[0], : SIZE[1]] - 0.8 * np.array([v - 2, u - 2])[:, None, None]
-                )
-                for u in range(5)
-            ]
-            for v in range(5)
-        ],
-        np.float32,
-    )
-    assert np.median(np.abs(estimated_disparity(light_field) - 0.8)) < 0.1

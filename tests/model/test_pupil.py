@@ -19,7 +19,6 @@ SIZE = (4, 5)
 RAYS = 160
 """Along each side of an aperture cell."""
 CODE = {"distance_mm": 0.24, "cell_um": 24, "pattern": {"kind": "uniform_colour", "seed": 4}}
-AT_LENS = {"distance_mm": 50, "cell_um": 1250, "pattern": {"kind": "uniform_colour", "seed": 2}}
 BETWEEN = {"distance_mm": 25, "cell_um": 900, "pattern": {"kind": "uniform_colour", "seed": 7}}
 LEFT_ROUND = {"diameter_mm": 25, "centre_mm": [0.8, -0.5]}
 PUPILS = {
@@ -135,12 +134,6 @@ def test_point_and_narrow_apertures_lie_inside_a_pupil_or_outside(fill):
     assert camera.view_shares()[0, 0] == pytest.approx(0.0 if fill == 0 else 0.025, abs=1e-3)
 
 
-def test_a_mask_at_the_lens_is_cut_by_the_pupil():
-    camera = camera_with({"diameter_mm": 25}, {"aperture": AT_LENS})
-    found = in_order_of_rays(build_imaging_matrix(camera, SIZE))
-    assert relative_error(found, psi_of_rays(camera, {"diameter_mm": 25})) < 5e-3
-
-
 def test_two_masks_are_seen_together_through_what_is_open():
     masks = {"code": CODE, "far": BETWEEN}
     camera = camera_with(LEFT_ROUND, masks)
@@ -182,28 +175,6 @@ def test_views_outside_of_the_pupil_have_no_coefficients_and_are_named():
     assert "(4, 3) 6 % open; views (0, 2), (2, 0), (2, 4), (4, 2) 28 % open" in narrow
 
 
-def test_the_day_one_lens_opens_its_corners_by_a_seventh():
-    """25 mm of round pupil behind 5 x 5 views of 5 mm; views of 3.5 mm lie wholly inside."""
-    camera = camera_with({"diameter_mm": 25})
-    shares = camera.view_shares()
-    assert shares[0, :2] == pytest.approx([0.14, 0.77], abs=0.005)
-    assert shares.sum() * 25 == pytest.approx(np.pi * 12.5**2, rel=1e-3)
-    assert camera.warnings() == [
-        "views (0, 0), (0, 4), (4, 0), (4, 4) 14 % open in the lens's pupil: less light, more noise"
-    ]
-    narrower = camera_with({"diameter_mm": 25}, aperture_cell_mm=3.5)
-    assert (narrower.view_shares() == 1).all()
-    assert narrower.warnings() == []
-
-
-def test_a_camera_without_a_pupil_is_written_as_before():
-    for camera in shipped_cameras().values():
-        assert camera.lens.pupil is None
-        assert "pupil" not in camera.model_dump_json()
-    given = camera_with({"diameter_mm": 25, "rim": {"diameter_mm": 26}})
-    assert Camera.model_validate_json(given.model_dump_json()) == given
-
-
 @pytest.mark.parametrize(
     ("pupil", "line"),
     [
@@ -218,3 +189,11 @@ def test_a_pupil_that_cannot_be_is_refused_with_one_line(pupil, line):
         validated(Camera, {"title": "t", "lens": {"pupil": pupil}}, "mine.yaml", CameraError)
     assert line in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_camera_without_a_pupil_is_written_as_before():
+    for camera in shipped_cameras().values():
+        assert camera.lens.pupil is None
+        assert "pupil" not in camera.model_dump_json()
+    given = camera_with({"diameter_mm": 25, "rim": {"diameter_mm": 26}})
+    assert Camera.model_validate_json(given.model_dump_json()) == given

@@ -13,7 +13,7 @@ import tifffile
 from capture_rigs import begun, still_rig
 
 from emmc_rig.captures.sequencer import Sequencer
-from emmc_rig.drivers.dng import Facts, encode_dng
+from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.raw import decode_raw
 from emmc_rig.errors import AppError
 from emmc_rig.model.files import SYSTEM_DISK
@@ -93,16 +93,6 @@ def test_exiftool_finds_nothing_wrong_with_the_file(session, tmp_path):
         if "Error" in line or ("Warning" in line and "minor" not in line.lower())
     ]
     assert not serious
-
-
-@needs_exiftool
-def test_what_is_not_known_is_not_stated(tmp_path):
-    mosaic = np.full((32, 40), 500, np.uint16)
-    (tmp_path / "a.dng").write_bytes(encode_dng(mosaic, "rggb", 64, 1023, None, facts=Facts()))
-    stated = told(tmp_path / "a.dng")
-    for name in ("ExposureTime", "ISO", "DateTimeOriginal", "SerialNumber", "ImageUniqueID"):
-        assert f"ExifIFD:{name}" not in stated
-    assert stated["ExifIFD:ExifVersion"] in ("0232", 232)
 
 
 def test_a_dng_in_a_session_states_time_serial_and_iso():

@@ -170,9 +170,16 @@ def test_a_stage_file_is_looked_for_beside_the_rig_s(tmp_path):
     assert RealRig.model_validate({k: v for k, v in described.items() if k != "kind"}).by_hand
 
 
-def test_a_misspelt_key_of_a_rig_names_the_nearest(tmp_path):
-    (tmp_path / "rig.yaml").write_text("stage: simulated\ncamera: simulated\nzero: {}\n")
-    with pytest.raises(AppError, match="did you mean 'zero_um'"):
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("stage: simulated\ncamera: simulated\nzero: {}\n", "did you mean 'zero_um'"),
+        ("kind: simulated\naxes: [mask_z]\n", "axes.0: input should be 'mask_x', 'mask_y', "),
+    ],
+)
+def test_a_misspelt_key_or_axis_of_a_rig_names_the_right_ones(tmp_path, text, said):
+    (tmp_path / "rig.yaml").write_text(text)
+    with pytest.raises(AppError, match=said):
         rig_description(str(tmp_path / "rig.yaml"), ImagedRig(scene="dark"))
     assert rig_description(SIMULATED, ImagedRig(scene="dark"))["scene"] == "dark"
 

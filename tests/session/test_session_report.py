@@ -23,7 +23,6 @@ from emmc_rig.session.brightness import ShotExposure, exposure_reasons, figures,
 from emmc_rig.session.frame_file import NO_FIGURES, frame_entry
 from emmc_rig.session.journal import RetryEntry
 from emmc_rig.session.session import Session
-from emmc_rig.simulators.still import StillStage
 
 ROOT = Path("/disk")
 
@@ -150,20 +149,6 @@ def test_hot_pixels_are_no_light_that_a_frame_is_metered_by():
     # What is left are hot pixels beside others: one in sixty of them.
     assert plain.saturated == 0
     assert spotted.saturated < 1e-4
-
-
-def test_a_still_stage_refuses_what_a_real_one_would():
-    from emmc_rig.drivers.errors import LimitExceededError, NotHomedError
-    from emmc_rig.simulators.clock import ManualClock
-
-    stage = StillStage(("x",), ManualClock(), move_s=0.5)
-    with pytest.raises(NotHomedError):
-        stage.move_to_um({"x": 1.0})
-    stage.home()
-    with pytest.raises(LimitExceededError):
-        stage.move_to_um({"x": -1.0})
-    assert stage.move_to_um({"x": 7.0}) == {"x": 7.0}
-    assert stage.position_um("x") == 7.0
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-import subprocess
-import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +33,6 @@ from emmc_rig.progress import Watcher
 from emmc_rig.session.board_sets import decoded
 from emmc_rig.session.journal import (
     FrameEntry,
-    Journal,
     RetryEntry,
     RunEntry,
     count_stored,
@@ -190,19 +187,6 @@ def test_any_operation_that_fails_stops_the_run_and_a_resume_completes_it(undist
         assert_whole(disk, expected)
 
 
-def test_a_full_disk_keeps_what_was_counted(undisturbed):
-    _, expected = undisturbed
-    disk = SimulatedDisk(capacity_bytes=20_000)
-    with pytest.raises(OSError, match="space"):
-        run_on(disk)
-    session = Session(ROOT / "s", disk)
-    assert 0 < len(session.stored) < len(expected)
-    assert not verify(session).damaged
-    disk.capacity_bytes = float("inf")
-    run_on(disk)
-    assert_whole(disk, expected)
-
-
 def test_without_syncs_a_power_cut_does_lose_what_was_counted(undisturbed):
     """The simulated disk is not kinder than a real one: the tests above could fail."""
     operations, _ = undisturbed
@@ -226,27 +210,6 @@ def test_without_syncs_a_power_cut_does_lose_what_was_counted(undisturbed):
         except AppError:
             lost += 1
     assert lost > 3
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's full device")
-def test_a_disk_that_is_really_full_is_reported_by_the_system():
-    with pytest.raises(OSError, match="space"):
-        SYSTEM_DISK.append(Path("/dev/full"), b"one byte too many")
-
-
-def test_bytes_not_synced_may_be_lost_and_synced_ones_never_are():
-    rng = np.random.default_rng(0)
-    outcomes = set()
-    for _ in range(200):
-        disk = SimulatedDisk()
-        write_whole(disk, Path("/kept"), b"kept")
-        disk.create(Path("/loose")).data += b"loose"
-        survived = disk.after_power_cut(rng)
-        assert survived.read(Path("/kept")) == b"kept"
-        names = survived.sizes(Path("/"))
-        outcomes.add(survived.read(Path("/loose")) if "loose" in names else None)
-    assert {None, b"", b"loose"} <= outcomes
-    assert any(data and data != b"loose" for data in outcomes)
 
 
 RETRY = RetryEntry(id="a", fault='\u00e9"', attempt=1)
@@ -318,16 +281,6 @@ def test_a_line_with_any_flipped_bit_does_not_count():
             assert decode_line(bytes(damaged)) is None
 
 
-def test_a_line_after_a_torn_one_is_read(tmp_path):
-    path = tmp_path / "j"
-    first, two, three = (RetryEntry(id="a", fault="x", attempt=n) for n in (1, 2, 3))
-    path.write_bytes(encode_line(first) + encode_line(two)[:-9])
-    Journal(SYSTEM_DISK, path).append(three)
-    again = Journal(SYSTEM_DISK, path)
-    assert again.entries == [first, three]
-    assert again.unreadable == 1
-
-
 def test_a_linked_name_leads_no_bytes_out_of_the_session(tmp_path, monkeypatch):
     monkeypatch.setattr("secrets.token_hex", lambda count: "0" * 2 * count)
     outside = tmp_path / "outside"
@@ -344,11 +297,6 @@ def on_disk(tmp_path):
     return run_on(SYSTEM_DISK, tmp_path)
 
 
-def test_a_session_on_a_real_disk_is_complete(on_disk, undisturbed):
-    assert verify(on_disk).is_complete
-    assert {name: on_disk.read(name) for name in undisturbed[1]} == undisturbed[1]
-
-
 def test_a_torn_raw_file_is_found_and_taken_again(on_disk, tmp_path, undisturbed):
     path = on_disk.path_of(on_disk.stored["shot-1-e0-r0"])
     path.write_bytes(path.read_bytes()[:-7])
@@ -358,16 +306,6 @@ def test_a_torn_raw_file_is_found_and_taken_again(on_disk, tmp_path, undisturbed
     again = run_on(SYSTEM_DISK, tmp_path)
     assert verify(again).is_complete
     assert path.read_bytes() == undisturbed[1]["shot-1-e0-r0"]
-
-
-def test_a_flipped_bit_in_a_raw_file_is_found(on_disk):
-    path = on_disk.path_of(on_disk.stored["dark-0-r1"])
-    data = bytearray(path.read_bytes())
-    data[900] ^= 4
-    path.write_bytes(data)
-    assert "SHA-256" in verify(Session(on_disk.folder)).damaged["dark-0-r1"]
-    with pytest.raises(AppError, match="damaged"):
-        Session(on_disk.folder).read("dark-0-r1")
 
 
 def test_a_torn_journal_line_costs_one_frame(on_disk, tmp_path):
@@ -474,62 +412,6 @@ def test_two_programs_do_not_work_on_one_session(on_disk):
     with held(on_disk.folder), pytest.raises(AppError, match=who), held(on_disk.folder):
         pass
     assert not (on_disk.folder / LOCK).exists()
-
-
-KILLED = """
-import fcntl, os, pathlib, sys
-from emmc_rig.session.lock import held
-
-def refuse(descriptor, how):
-    raise OSError(37, "No locks available")
-
-fcntl.flock = refuse
-with held(pathlib.Path(sys.argv[1])):
-    os._exit(9)
-"""
-
-
-def refuse_to_lock(descriptor, how):
-    raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-
-@pytest.fixture
-def no_locks(monkeypatch):
-    """A disk on which files cannot be locked, as some in a network."""
-
-    monkeypatch.setattr("fcntl.flock", refuse_to_lock)
-
-
-@pytest.mark.usefixtures("no_locks")
-def test_two_programs_do_not_work_on_one_session_where_files_cannot_be_locked(on_disk):
-    who = rf"held by `.*` \(process {os.getpid()} on .*; wait until it ends, .*, delete .*{LOCK}"
-    for folder in (on_disk.folder, on_disk.folder.with_name("to-be-made")):
-        with held(folder), pytest.raises(AppError, match=who.replace(LOCK, "lock")), held(folder):
-            pass
-    assert not list(on_disk.folder.parent.rglob("*lock"))
-
-
-@pytest.mark.usefixtures("no_locks")
-def test_a_killed_capture_where_files_cannot_be_locked_says_what_to_delete(on_disk):
-    killed = [sys.executable, "-c", KILLED, on_disk.folder]
-    assert subprocess.run(killed, check=False).returncode == 9
-    with pytest.raises(AppError, match=f"it has ended: delete .*{LOCK}"), held(on_disk.folder):
-        pass
-    (on_disk.folder / LOCK).unlink()
-    with held(on_disk.folder):
-        pass
-
-
-def test_a_lock_by_file_holds_also_for_a_program_that_can_lock_files(on_disk):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fcntl.flock", refuse_to_lock)
-        lock = held(on_disk.folder)
-        lock.__enter__()
-    with pytest.raises(AppError, match="held by"), held(on_disk.folder):
-        pass
-    lock.__exit__(None, None, None)
-    with held(on_disk.folder):
-        pass
 
 
 def test_a_folder_that_is_no_session_is_reported(tmp_path):
