@@ -271,11 +271,21 @@ def test_every_block_of_the_documentation_runs_and_loses_nothing(document):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("small", "_fitted_once")
-def test_the_tutorial_as_typed_ends_in_trust():
-    page = ROOT / "docs" / "tutorial.md"
+@pytest.mark.parametrize("name", ["tutorial", "own-data", "figure"])
+def test_a_page_as_typed_ends_in_trust_and_shows_what_each_command_prints(name):
+    page = ROOT / "docs" / f"{name}.md"
     typed = [words for why, found in blocks(page) if why is None for words in found]
-    said = {words[0]: "".join(program(*words)[1:]) for words in typed}
-    assert re.search(r"^trust: ", said["reconstruct"], re.M), said["reconstruct"]
+    said = [(words[0], "".join(program(*words)[1:])) for words in typed]
+    assert re.search(r"^trust: ", dict(said)["reconstruct"], re.M), said
+    everything = without_numbers("".join(text for _, text in said))
+    shown = [found["text"] for found in BLOCK.finditer(page.read_text("utf-8"))
+             if found["language"] == "output"]  # fmt: skip
+    assert all(without_numbers(text) in everything for text in shown), everything
+
+
+def without_numbers(text):
+    """Return what a command prints, of another time, accuracy and folder."""
+    return re.sub(r"\d+(\.\d+)?", "0", text.replace(f"{Path.cwd()}/", ""))
 
 
 def test_the_page_of_results_its_charts_and_the_readmes_table_are_what_the_command_makes():

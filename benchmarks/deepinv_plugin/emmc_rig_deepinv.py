@@ -1,0 +1,79 @@
+"""The peer `deepinv-pnp`: deepinv's plug-and-play HQS with its total variation denoiser of views.
+
+Exact data steps of Psi and a denoiser alternate, with noise levels that fall from step to step.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from emmc_rig.model.settings import Settings
+from emmc_rig.reconstruction.method import Given, Method, cost_words
+from emmc_rig.reconstruction.result import Reconstruction, Status
+
+if TYPE_CHECKING:
+    from emmc_rig.reconstruction.methods import MethodSettings
+
+
+class DeepinvSettings(Settings):
+    """Noise levels of the denoiser, 1 for white, and its own iterations."""
+
+    steps: int = Field(default=30, ge=1)
+    first_sigma: float = Field(default=0.5, gt=0)
+    last_sigma: float = Field(default=0.02, gt=0)
+    denoiser_steps: int = Field(default=30, ge=1)
+
+
+def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
+    # PyTorch and deepinv take seconds to import, which a command without them need not wait for.
+    import deepinv
+    import torch
+
+    from emmc_rig.torch import physics
+
+    started, own, frames = time.perf_counter(), settings.of(DeepinvSettings), given.frames
+    operator = physics(given.psi, usable=frames.usable)
+    readings = torch.tensor(frames.readings, dtype=torch.float32)[None]
+    even = torch.ones_like(operator.A_adjoint(readings))
+    even *= readings.sum() / (operator.A(even) * torch.tensor(frames.usable)).sum()
+    denoiser = deepinv.models.TVDenoiser(n_it_max=own.denoiser_steps)
+    sigmas = np.geomspace(own.first_sigma, own.last_sigma, own.steps)
+    solver = deepinv.optim.HQS(
+        data_fidelity=deepinv.optim.L2(),
+        prior=deepinv.optim.PnP(deepinv.models.TimeAgnosticNet(denoiser)),
+        g_param=sigmas.tolist(),
+        stepsize=((sigmas / frames.noise_sigma) ** 2).tolist(),
+        max_iter=own.steps,
+        custom_init=lambda *_: even,
+    )
+    with torch.no_grad():
+        light_field = operator.light_field(solver(readings, operator))[0].numpy()
+    return Reconstruction(
+        method="deepinv-pnp",
+        light_field=np.clip(light_field, 0, 1),
+        status=Status.CONVERGED,
+        advice="",
+        steps=own.steps,
+        objective=(),
+        seconds=time.perf_counter() - started,
+        parameters={"noise_sigma": frames.noise_sigma},
+    )
+
+
+METHODS = (
+    Method(
+        "deepinv-pnp",
+        "deepinv's plug-and-play with total variation of each view",
+        "smooth areas with sharp edges in every view",
+        cost_words(1, 1),
+        "to compare with another library; needs deepinv",
+        _solve,
+        "deepinv_pnp",
+        DeepinvSettings,
+        package="deepinv",
+    ),
+)
