@@ -1,6 +1,7 @@
-"""The peer `deepinv-pnp`: deepinv's plug-and-play HQS with its total variation denoiser of views.
+"""The peer `deepinv-pnp`: deepinv's plug-and-play HQS, with its total variation denoiser.
 
-Exact data steps of Psi and a denoiser alternate, with noise levels that fall from step to step.
+Exact data steps of Psi and the denoiser of all epipolar images alternate, with noise levels that
+fall from step to step.
 """
 
 from __future__ import annotations
@@ -20,12 +21,16 @@ if TYPE_CHECKING:
 
 
 class DeepinvSettings(Settings):
-    """Noise levels of the denoiser, 1 for white, and its own iterations."""
+    """Strength of the denoiser, first and last, and its iterations.
 
-    steps: int = Field(default=30, ge=1)
-    first_sigma: float = Field(default=0.5, gt=0)
+    Of nine settings tried on 48x64 of dragons and buttercup, one shot: 60 steps gain 3.5 and 0.0 dB
+    over 30; epipolar images instead of views 5 and 2 dB; first strengths of 0.3 lose 0.2 and 0.0.
+    """
+
+    steps: int = Field(default=60, ge=1)
+    first_sigma: float = Field(default=1.0, gt=0)
     last_sigma: float = Field(default=0.02, gt=0)
-    denoiser_steps: int = Field(default=30, ge=1)
+    denoiser_steps: int = Field(default=8, ge=1)
 
 
 def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
@@ -40,11 +45,22 @@ def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
     readings = torch.tensor(frames.readings, dtype=torch.float32)[None]
     even = torch.ones_like(operator.A_adjoint(readings))
     even *= readings.sum() / (operator.A(even) * torch.tensor(frames.usable)).sum()
-    denoiser = deepinv.models.TVDenoiser(n_it_max=own.denoiser_steps)
+    views = given.psi.light_field_shape[:2]
+    denoiser = deepinv.models.TimeAgnosticNet(
+        deepinv.models.TVDenoiser(n_it_max=own.denoiser_steps)
+    )
+
+    def denoised(x: torch.Tensor, strength: torch.Tensor) -> torch.Tensor:
+        for order in ((0, 1, 2, 4, 3, 5), (0, 1, 3, 5, 2, 4)):  # images (u, x), then (v, y)
+            slices = x.unflatten(2, views).permute(order)
+            smooth = denoiser(slices.flatten(2, 3), strength).reshape(slices.shape)
+            x = smooth.permute(*np.argsort(order).tolist()).flatten(2, 3)
+        return x
+
     sigmas = np.geomspace(own.first_sigma, own.last_sigma, own.steps)
     solver = deepinv.optim.HQS(
         data_fidelity=deepinv.optim.L2(),
-        prior=deepinv.optim.PnP(deepinv.models.TimeAgnosticNet(denoiser)),
+        prior=deepinv.optim.PnP(denoised),
         g_param=sigmas.tolist(),
         stepsize=((sigmas / frames.noise_sigma) ** 2).tolist(),
         max_iter=own.steps,
@@ -67,8 +83,8 @@ def _solve(given: Given, settings: MethodSettings) -> Reconstruction:
 METHODS = (
     Method(
         "deepinv-pnp",
-        "deepinv's plug-and-play with total variation of each view",
-        "smooth areas with sharp edges in every view",
+        "deepinv's plug-and-play with total variation of epipolar images",
+        "smooth areas with sharp edges, small disparities",
         cost_words(1, 1),
         "to compare with another library; needs deepinv",
         _solve,

@@ -151,9 +151,11 @@ def test_every_task_of_a_notebook_runs(tmp_path, monkeypatch):
         "dn": camera.expose(emmc.scene("wide-disparity", size=(48, 64)), rng).frames_dn,
     }
     for task, text in examples(NOTEBOOK).items():
-        if task in ("napari", "xarray"):
+        if task in ("deepinv", "napari", "xarray"):
             if not find_spec(task):
                 continue
+            if task == "deepinv":
+                import_module("peer_deepinv")
             if task == "napari":  # without a window
                 napari = import_module(task)
                 monkeypatch.setattr(napari, "Viewer", napari.components.ViewerModel)
@@ -161,9 +163,27 @@ def test_every_task_of_a_notebook_runs(tmp_path, monkeypatch):
     assert names["result"].verdict.level == names["measured"].verdict.level == "trust"
     better = names["result"].compare(names["scene"])
     assert better["psnr_db"] > better["replicate_psnr_db"]
+    if "operator" in names:
+        solved, plain = (
+            psnr_db(operator_lf.numpy(), np.asarray(names["scene"]))
+            for operator_lf in (
+                names["light_field"],
+                names["operator"].light_field(names["operator"].A_dagger(names["y"]))[0],
+            )
+        )
+        assert solved > plain + 3
     assert names["psi"].relative_difference(camera.psi((48, 64))) < 0.03
     np.testing.assert_array_equal(np.asarray(names["again"]), np.asarray(names["result"]))
     pyplot.close("all")
+
+
+@pytest.mark.parametrize(
+    ("word", "page"),
+    [("Refocus", "notebook"), ("Depth", "notebook"), ("Windows", "tutorial"), ("figure", "figure")],
+)
+def test_a_heading_leads_the_search_for_a_word_to_its_page(word, page):
+    text = (ROOT / "docs" / f"{page}.md").read_text("utf-8")
+    assert re.search(rf"^##? .*\b{word}\b", text, re.M)
 
 
 def test_every_camera_and_bench_is_drawn_as_the_script_draws_it(tmp_path):
@@ -281,6 +301,12 @@ def test_a_page_as_typed_ends_in_trust_and_shows_what_each_command_prints(name):
     shown = [found["text"] for found in BLOCK.finditer(page.read_text("utf-8"))
              if found["language"] == "output"]  # fmt: skip
     assert all(without_numbers(text) in everything for text in shown), everything
+    if name == "figure":
+        names: dict = {}
+        exec(compile(examples(page.read_text("utf-8"))["Draw it"], name, "exec"), names)
+        assert names["verdict"].level == "trust"
+        assert names["interval_db"][0] < names["accuracy_db"] < names["interval_db"][1]
+        pyplot.close("all")
 
 
 def without_numbers(text):

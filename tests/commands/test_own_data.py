@@ -55,8 +55,8 @@ def test_same_seed_same_bytes_and_another_seed_another_film_and_noise(made, run,
     done(run("demo", "--own-data", "other", "--seed", 1))
     assert contents(tmp_path / "again") == contents(made)
     for name in ("photo.tif", "scene-1.tif"):
-        one, other = (tifffile.imread(folder / name) for folder in (made, tmp_path / "other"))
-        assert (one != other).mean() > 0.5
+        first, other = (tifffile.imread(folder / name) for folder in (made, tmp_path / "other"))
+        assert (first != other).mean() > 0.5
 
 
 def filled(place):
