@@ -23,6 +23,7 @@ from programs import done, program
 import emmc_rig as emmc
 from emmc_rig import cli
 from emmc_rig.commands.options import SIZE_VARIABLE
+from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.process import session_calibration as calibrate_session
 from emmc_rig.session import measured_psi
 
@@ -155,7 +156,7 @@ def test_every_task_of_a_notebook_runs(tmp_path, monkeypatch):
             if not find_spec(task):
                 continue
             if task == "deepinv":
-                import_module("peer_deepinv")
+                import_module("peer_deepinv")  # the build of PyTorch may lack what it registers
             if task == "napari":  # without a window
                 napari = import_module(task)
                 monkeypatch.setattr(napari, "Viewer", napari.components.ViewerModel)
@@ -164,14 +165,9 @@ def test_every_task_of_a_notebook_runs(tmp_path, monkeypatch):
     better = names["result"].compare(names["scene"])
     assert better["psnr_db"] > better["replicate_psnr_db"]
     if "operator" in names:
-        solved, plain = (
-            psnr_db(operator_lf.numpy(), np.asarray(names["scene"]))
-            for operator_lf in (
-                names["light_field"],
-                names["operator"].light_field(names["operator"].A_dagger(names["y"]))[0],
-            )
-        )
-        assert solved > plain + 3
+        operator, truth = names["operator"], np.asarray(names["scene"])
+        plain = operator.light_field(operator.A_dagger(names["y"]))[0]
+        assert psnr_db(names["light_field"].numpy(), truth) > psnr_db(plain.numpy(), truth) + 6
     assert names["psi"].relative_difference(camera.psi((48, 64))) < 0.03
     np.testing.assert_array_equal(np.asarray(names["again"]), np.asarray(names["result"]))
     pyplot.close("all")
