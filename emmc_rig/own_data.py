@@ -51,7 +51,7 @@ CELLS, CELL_UM = (64, 64), 24
 ELECTRONS_PER_S = 300_000
 PLAN = Plan(
     camera=CAMERA_FILE,
-    shots=(PlannedShot(exposure_s=EXPOSURE_S, repeats=2),),
+    shots=(PlannedShot(exposure_s=(EXPOSURE_S,), repeats=2),),
     whiteboards=Boards(
         views=(),
         references=2,

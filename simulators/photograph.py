@@ -14,9 +14,9 @@ def photographed(cells: NDArray[np.floating], rng: np.random.Generator) -> NDArr
     """Return a photograph, (y, x), of a mask's transmittances (row, column) in a dark frame."""
     drawn = np.pad(np.kron(cells, np.ones((PX_PER_CELL, PX_PER_CELL))), FRAME_PX)
     bottom, right = drawn.shape
-    corners = [(0, 0), (right, 0), (right, bottom), (0, bottom)]
-    seen = [(9, 12), (right - 18, 5), (right - 7, bottom - 14), (5, bottom - 4)]
-    aside = cv2.getPerspectiveTransform(*(np.array(some, np.float32) for some in (corners, seen)))
+    corners = np.array([(0, 0), (right, 0), (right, bottom), (0, bottom)], np.float32)
+    moved = np.array([(9, 12), (-18, 5), (-7, -14), (5, -4)], np.float32)
+    aside = cv2.getPerspectiveTransform(corners, corners + moved)
     sharp = cv2.warpPerspective(drawn, aside, (right, bottom))
     light = CLEAR_DN * cv2.GaussianBlur(sharp, (0, 0), BLUR_PX)
     noisy = light + BLACK_DN + rng.normal(0, NOISE_DN, light.shape)
