@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from emmc_rig.model.settings import Settings
-from emmc_rig.reconstruction.method import Given, Method, cost_words
+from emmc_rig.reconstruction.method import Given, Method
 from emmc_rig.reconstruction.result import Reconstruction, Status
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ METHODS = (
         "deepinv-pnp",
         "deepinv's plug-and-play with total variation of epipolar images",
         "smooth areas with sharp edges, small disparities",
-        cost_words(1, 1),
+        "about 11 CPU s for 64x80 pixels from one shot",
         "to compare with another library; needs deepinv",
         _solve,
         "deepinv_pnp",
