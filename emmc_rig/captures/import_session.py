@@ -41,7 +41,7 @@ from emmc_rig.session.lock import held
 from emmc_rig.session.planned import SHOT_DARK, VALIDATION, Bench, PlannedFrame
 from emmc_rig.session.session import Frozen, Session, wall_time
 from emmc_rig.session.verify import verify_frames
-from emmc_rig.store.folders import refuse_inside_session
+from emmc_rig.store.folders import refuse_filled, refuse_inside_session
 from emmc_rig.store.results import command_line, versions
 
 KIND_ORDER = ("dark", "reference", "whiteboard", "open", "check", "turned", VALIDATION, "shot")
@@ -135,10 +135,7 @@ def import_session(
             f"{known.sensor.cfa_name}: take no planes, or write cfa: mono"
         )
     refuse_inside_session(out)
-    if out.exists() and not out.is_dir():
-        raise AppError(f"{out}: a file, where a folder is meant; name another")
-    if out.exists() and any(out.iterdir()):
-        raise AppError(f"{out}: holds something already; name another folder")
+    refuse_filled(out)
     try:
         with held(out), tempfile.TemporaryDirectory(prefix="emmc-import-") as spool:
             notes: list[str] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -37,12 +38,22 @@ def demo(
         bool, typer.Option("--exact-psi", help="reconstruct with the exact Psi too, for comparison")
     ] = False,
     dictionary: DictionaryOption = None,
+    own_data: Annotated[
+        Path | None,
+        typer.Option(
+            "--own-data",
+            help="only write a folder of files to import: frames, a mask's photograph, a camera",
+        ),
+    ] = None,
     out: OutOption = Path("emmc-demo"),
 ) -> None:
     """Try it on a simulated rig: calibrate, capture, reconstruct.
 
     The method adaptive runs here without TV + dictionary.
     """
+    if own_data is not None:
+        _write_own_data(own_data, seed)
+        return
     import emmc_rig as emmc
     from emmc_rig.commands.first_run import helped_to_compile
     from emmc_rig.demo import DemoSettings, run_demo
@@ -91,3 +102,27 @@ def demo(
     tell(f"open {out / 'report.html'}")
     show_verdict(metrics)
     give_result(out)
+
+
+def _write_own_data(out: Path, seed: int) -> None:
+    """Write the folder of --own-data, and print the commands that go on from it."""
+    from emmc_rig import own_data
+    from emmc_rig.store.folders import refuse_filled, result_folder
+
+    refuse_filled(out)
+    with result_folder(out, "demo --own-data") as folder, shown_progress() as bars:
+        counts = own_data.write_own_data(folder, seed, bars)
+    mask, photo, table, camera = (
+        shlex.quote(str(out / name))
+        for name in ("mine.png", own_data.PHOTO, own_data.TABLE, own_data.CAMERA_FILE)
+    )
+    rows, columns = own_data.CELLS
+    frames = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    tell(f"{counts.total()} frames ({frames}), the camera's file and a photograph, in {out}")
+    tell(
+        f"go on with: emmc-rig mask {photo} --cells {rows}x{columns} "
+        f"--cell-um {own_data.CELL_UM} --out {mask}"
+    )
+    tell(f"then: emmc-rig import {table} --camera {camera} --out bench")
+    tell("then: emmc-rig reconstruct bench")
+    give_result(out, frames=counts.total(), seed=seed)

@@ -23,6 +23,7 @@ MODES: dict[str, dict[str, set[str]]] = {
         "plan": {"camera", "size", "target", "skip", "few", "frames", "out"},
     },
     "capture": {"new": {"out"}},
+    "demo": {"own_data": {"seed"}},
     "export": {"list_formats": set()},
     "reconstruct": {"list_methods": set()},
     "stability": {"faults": set()},

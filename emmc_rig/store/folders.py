@@ -204,6 +204,17 @@ def refuse_missing(folder: Path, remedy: str) -> None:
         raise AppError(f"{folder}: no such folder; {remedy}")
 
 
+def refuse_filled(out: Path) -> None:
+    """Raise AppError unless the folder is missing or empty."""
+    try:
+        if out.exists() and not out.is_dir():
+            raise AppError(f"{out}: a file, where a folder is meant; name another")
+        if out.exists() and any(out.iterdir()):
+            raise AppError(f"{out}: holds something already; name another folder")
+    except OSError as fault:
+        raise AppError(f"{out}: cannot be read ({fault.strerror or fault})") from fault
+
+
 def is_session(folder: Path) -> bool:
     """Return whether a folder is a session."""
     return (folder / SESSION_JOURNAL).is_file() and (folder / SESSION_HEADER).is_file()

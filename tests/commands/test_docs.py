@@ -26,6 +26,7 @@ import emmc_rig as emmc
 from emmc_rig import cli
 from emmc_rig.commands.options import SIZE_VARIABLE
 from emmc_rig.live.steps import NEEDS
+from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.process import session_calibration as calibrate_session
 from emmc_rig.session import measured_psi
 
@@ -154,9 +155,11 @@ def test_every_task_of_a_notebook_runs(tmp_path, monkeypatch):
         "dn": camera.expose(emmc.scene("wide-disparity", size=(48, 64)), rng).frames_dn,
     }
     for task, text in examples(NOTEBOOK).items():
-        if task in ("napari", "xarray"):
+        if task in ("deepinv", "napari", "xarray"):
             if not find_spec(task):
                 continue
+            if task == "deepinv":
+                import_module("peer_deepinv")  # the build of PyTorch may lack what it registers
             if task == "napari":  # without a window
                 napari = import_module(task)
                 monkeypatch.setattr(napari, "Viewer", napari.components.ViewerModel)
@@ -164,9 +167,22 @@ def test_every_task_of_a_notebook_runs(tmp_path, monkeypatch):
     assert names["result"].verdict.level == names["measured"].verdict.level == "trust"
     better = names["result"].compare(names["scene"])
     assert better["psnr_db"] > better["replicate_psnr_db"]
+    if "operator" in names:
+        operator, truth = names["operator"], np.asarray(names["scene"])
+        plain = operator.light_field(operator.A_dagger(names["y"]))[0]
+        assert psnr_db(names["light_field"].numpy(), truth) > psnr_db(plain.numpy(), truth) + 6
     assert names["psi"].relative_difference(camera.psi((48, 64))) < 0.03
     np.testing.assert_array_equal(np.asarray(names["again"]), np.asarray(names["result"]))
     pyplot.close("all")
+
+
+@pytest.mark.parametrize(
+    ("word", "page"),
+    [("Refocus", "notebook"), ("Depth", "notebook"), ("Windows", "tutorial"), ("figure", "figure")],
+)
+def test_a_heading_leads_the_search_for_a_word_to_its_page(word, page):
+    text = (ROOT / "docs" / f"{page}.md").read_text("utf-8")
+    assert re.search(rf"^##? .*\b{word}\b", text, re.M)
 
 
 def test_every_camera_and_bench_is_drawn_as_the_script_draws_it(tmp_path):
@@ -315,6 +331,31 @@ def test_the_steps_of_day_one_are_those_of_the_live_page():
     assert f"Five steps: {', '.join(NEEDS)}." in page
     commands = getattr(typer.main.get_command(cli.app), "commands", {})
     assert f": {', '.join(NEEDS)}." in commands["live"].help
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small", "_fitted_once")
+@pytest.mark.parametrize("name", ["own-data", "figure"])
+def test_a_page_as_typed_ends_in_trust_and_shows_what_each_command_prints(name):
+    page = ROOT / "docs" / f"{name}.md"
+    typed = [words for why, found in blocks(page) if why is None for words in found]
+    said = [(words[0], "".join(program(*words)[1:])) for words in typed]
+    assert re.search(r"^trust: ", dict(said)["reconstruct"], re.M), said
+    everything = without_numbers("".join(text for _, text in said))
+    shown = [found["text"] for found in BLOCK.finditer(page.read_text("utf-8"))
+             if found["language"] == "text"]  # fmt: skip
+    assert all(without_numbers(text) in everything for text in shown), everything
+    if name == "figure":
+        names: dict = {}
+        exec(compile(examples(page.read_text("utf-8"))["Draw it"], name, "exec"), names)
+        assert names["verdict"].level == "trust"
+        assert names["interval_db"][0] < names["accuracy_db"] < names["interval_db"][1]
+        pyplot.close("all")
+
+
+def without_numbers(text):
+    """Return what a command prints, of another time, accuracy and folder."""
+    return re.sub(r"\d+(\.\d+)?", "0", text.replace(f"{Path.cwd()}/", ""))
 
 
 def test_the_page_of_results_its_charts_and_the_readmes_table_are_what_the_command_makes():

@@ -23,8 +23,11 @@ pytestmark = pytest.mark.slow
 
 PAGE = Path(__file__).parents[2] / "docs/own-data.md"
 SECTION = PAGE.read_text(encoding="utf-8").partition("## An example")[2].partition("\n## ")[0]
-BLOCKS = dict(re.findall(r"^```(\w*)\n(.*?)^```$", SECTION, re.M | re.S))
-COMMANDS = [line.split()[1:] for line in BLOCKS[""].splitlines()]
+FENCED = re.findall(r"^```(\w*)\n(.*?)^```$", SECTION, re.M | re.S)
+BLOCKS = dict(FENCED)
+COMMANDS = [text.split()[1:] for language, text in FENCED if not language]
+MADE, *STEPS = COMMANDS
+OWN = Path(MADE[-1])
 CELLS = np.where(np.random.default_rng(1).random((64, 64)) < 0.5, 0.92, 0.02)
 OPTICS = Optics(
     mask_um=500, pitch_um=24, cell_um=24, aperture_cell_um=2000, offset_um=(0, 0), rotation_rad=0
@@ -60,12 +63,16 @@ def scene(size, views=(5, 5), disparity=0.6):
 
 
 def filmed(folder, sensor, change=lambda dn: dn, cells=CELLS):
-    """Write what the page's example has in its folder; return the scene, (v, u, y, x, colour)."""
+    """Write the page's example without whiteboards; return the scene, (v, u, y, x, colour)."""
+    folder /= OWN
+    folder.mkdir()
     (folder / "mine.yaml").write_text(BLOCKS["yaml"])
-    (folder / "table.csv").write_text(BLOCKS["text"])
+    names, *lines = BLOCKS["text"].splitlines()
+    table = [names, *(line for line in lines if line.split(",")[1] in ("dark", "shot"))]
+    (folder / "table.csv").write_text("\n".join(table))
     tifffile.imwrite(folder / "photo.tif", photograph(CELLS))
     bench, field = Bench(cells, (56, 56), optics=OPTICS, sensor=sensor), scene((56, 56))
-    for row in csv.DictReader(BLOCKS["text"].splitlines()):
+    for row in csv.DictReader(table):
         lit = row["kind"] == "shot"
         dn = bench.take(float(row["exposure_s"]), lit=lit, scene=field if lit else None)
         tifffile.imwrite(folder / row["file"], change(dn))
@@ -83,8 +90,8 @@ def verdict(session):
 
 def test_a_photograph_of_the_mask_and_four_files_become_the_light_field(tmp_path, run):
     truth = filmed(tmp_path, Sensor(bayer=False, electrons_per_s=800_000))[..., 1]
-    assert [command[0] for command in COMMANDS] == ["mask", "import", "reconstruct"]
-    for command in COMMANDS:
+    assert [command[0] for command in STEPS] == ["mask", "import", "reconstruct"]
+    for command in STEPS:
         done(run(*command))
     with h5py.File(tmp_path / "bench/reconstruction/light_field.h5") as file:
         field = np.array(file["light_field"]).mean(-1)
@@ -101,9 +108,9 @@ def with_gamma(dn):
 
 
 def camera_changed(folder, change):
-    camera = yaml.safe_load((folder / "mine.yaml").read_text())
+    camera = yaml.safe_load((folder / OWN / "mine.yaml").read_text())
     change(camera)
-    (folder / "mine.yaml").write_text(yaml.safe_dump(camera))
+    (folder / OWN / "mine.yaml").write_text(yaml.safe_dump(camera))
 
 
 def of_8_bits(camera):
@@ -125,7 +132,7 @@ def test_a_mistake_that_no_file_shows_is_named_by_the_verdict(mistake, tmp_path,
     sensor, written, described, words = UNKNOWABLE[mistake]
     filmed(tmp_path, replace(sensor, electrons_per_s=400_000), written)
     camera_changed(tmp_path, described)
-    mask, imported, reconstruct = COMMANDS
+    mask, imported, reconstruct = STEPS
     for command in (mask, imported, [*reconstruct, "--method", "tv"]):
         done(run(*command))
     found = verdict(tmp_path / "bench")
@@ -142,9 +149,9 @@ def test_another_phase_of_the_filters_is_another_mask_to_the_verdict(cfa, tmp_pa
     cells = 0.02 + 0.9 * rgbw[np.random.default_rng(3).integers(0, 4, (64, 64))]
     filmed(tmp_path, Sensor(electrons_per_s=800_000), cells=cells)
     codes = np.round(65_535 * cells[..., ::-1]).astype(np.uint16)
-    cv2.imwrite(str(tmp_path / "mine.png"), codes)
+    cv2.imwrite(str(tmp_path / OWN / "mine.png"), codes)
     camera_changed(tmp_path, lambda camera: camera["sensor"].update(cfa=cfa))
-    _, imported, reconstruct = COMMANDS
+    _, imported, reconstruct = STEPS
     for command in (imported, [*reconstruct, "--method", "tv"]):
         done(run(*command))
     found = verdict(tmp_path / "bench")
