@@ -153,7 +153,7 @@ ONE_LINE = {
         "one mask"
     ),
     "stability --fast --scene dark --scene dark": "two scenes are called 'dark'",
-    "stability --fast --method dict-omp --dictionary none.h5": "none.h5",
+    "stability --fast --method dict-admm --dictionary none.h5": "none.h5",
     "chart --fast --method tv --method tv-dic": "did you mean 'tv-dict'",
     "chart --fast --method tv --scene nowhere": "no scene 'nowhere'",
     "chart --fast --method tv --scene dark --scene ./dark": "two scenes are called 'dark'",

@@ -44,7 +44,7 @@ def reconstructed(folder, out, method, **given):
     return outcome
 
 
-@pytest.mark.parametrize(("method", "dictionary"), [("tv", None), ("dict-omp", "dct")])
+@pytest.mark.parametrize(("method", "dictionary"), [("tv", None), ("dict-admm", "dct")])
 def test_frames_become_a_light_field_with_a_page_and_metrics(frames, tmp_path, method, dictionary):
     metrics = reconstructed(frames, tmp_path, method, dictionary_spec=dictionary, truth=SCENE)
     light_field = load_hdf5(tmp_path / "light_field.h5")
@@ -131,7 +131,7 @@ def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):
     Dictionary.normalised(atoms, "ksvd").save(tmp_path / "small.h5")
     with pytest.raises(DictionaryError, match="3x3 views"):
         reconstructed(
-            frames, tmp_path / "out", "dict-omp", dictionary_spec=str(tmp_path / "small.h5")
+            frames, tmp_path / "out", "dict-admm", dictionary_spec=str(tmp_path / "small.h5")
         )
 
 

@@ -104,7 +104,7 @@ def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step
     ("method", "binning"),
     [
         ("tv", 1),
-        ("dict-omp", 1),
+        ("dict-admm", 1),
         ("tv-dict", 2),
         ("adaptive-fast", 2),
         ("adaptive", 1),

@@ -41,7 +41,7 @@ QUICK = TablesSettings(
     binned_size=(16, 18),
     methods=MethodSettings(
         tv=TVSettings(max_steps=2),
-        sparse=SparseSettings(stride=8, solver=BPDNSettings(method="admm", max_steps=3, rtol=0.5)),
+        sparse=SparseSettings(stride=8, solver=BPDNSettings(max_steps=3, rtol=0.5)),
     ),
     binned_stride=8,
 )

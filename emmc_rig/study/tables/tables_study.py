@@ -50,15 +50,12 @@ UNTRAINED = ("dct", "lambertian")
 class TablesSettings(Settings):
     """How everything is computed; sizes are middles of each scene.
 
-    The solver of `methods.sparse`, ADMM as in the paper, codes the patches of `dict-admm` once;
-    `tv-dict` starts from the same patches. dictionary: see `open_dictionary`.
+    Patches are coded once, for `dict-admm` and for `tv-dict`. dictionary: see `open_dictionary`.
     """
 
     size: Size = None
     binned_size: Size = None
-    methods: MethodSettings = MethodSettings(
-        sparse=SparseSettings(solver=BPDNSettings(method="admm"))
-    )
+    methods: MethodSettings = MethodSettings()
     binned_stride: int = Field(default=4, ge=2, multiple_of=2)
     dictionary: str | None = None
     seed: int = Field(default=0, ge=0)
@@ -76,7 +73,7 @@ FAST = TablesSettings(
     binned_size=(32, 32),
     methods=MethodSettings(
         tv=TVSettings(max_steps=100),
-        sparse=SparseSettings(solver=BPDNSettings(method="admm", rtol=1e-2, max_steps=200)),
+        sparse=SparseSettings(solver=BPDNSettings(rtol=1e-2, max_steps=200)),
     ),
 )
 """Crops: all tables on thirteen scenes in three minutes on two cores."""
