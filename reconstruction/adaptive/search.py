@@ -203,18 +203,9 @@ def evidence_at(
     """Return the evidence of the patches at corners (patch, 2), in pixels; see `patch_evidence`."""
     half = ((patches.side - 1) * patches.spacing) // 2
     bright = data.brightness[corners[:, 0] + half, corners[:, 1] + half]
+    places = patches.places(data.psi.shots)
     return patch_evidence(
-        data.psi,
-        data.residual.frames,
-        data.residual.noise,
-        data.residual.usable,
-        bright,
-        corners,
-        patches.places(data.psi.shots),
-        disparities,
-        prior,
-        possible,
-        kinds,
+        data.residual, bright, corners, places, disparities, prior, possible, kinds
     )
 
 
