@@ -119,7 +119,7 @@ def motion(relief: Relief, residual: Array, noise_sigma: float) -> Motion | None
 def _differences(
     relief: Relief, residual: Array, shots: NDArray[np.intp], noise_sigma: float
 ) -> tuple[Array, Array, float]:
-    """Return the squares by which shots differ in spots, by which they may, and may anywhere.
+    """Return squared differences between shots in spots: measured, expected, least expected.
 
     The first two are (shot, pixel_y, pixel_x); all in squared readings.
     Of readings m that are expected, the residual is a m + e, with `a` by least squares over a spot,
