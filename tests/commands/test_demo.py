@@ -148,9 +148,7 @@ def test_three_shots_of_a_real_light_field_beat_the_copied_centre_view(tmp_path)
 @pytest.mark.slow
 def test_the_loop_reconstructs_with_a_dictionary(tmp_path):
     name = "rgbw-bayer-2shots"
-    settings = DemoSettings(
-        "near-planar", name, find_camera(name), (24, 32), method="dict-admm", dictionary="dct"
-    )
+    settings = DemoSettings("near-planar", name, find_camera(name), (24, 32), method="dict-admm")
     metrics = run_demo(settings, tmp_path)
     assert metrics["method"] == "dict-admm"
     assert metrics["parameters"]["patches"] > 10

@@ -183,7 +183,7 @@ WRONG_USAGE = {
     "demo --shots 0": "",
     "demo --size tiny": "192x256",
     "demo --dictionary nothing.h5": "no effect on --method adaptive",
-    "demo --method adaptive --dictionary dct": "--dictionary",
+    "demo --method adaptive --dictionary lambertian": "--dictionary",
     "reconstruct taken --dictionary nothing.h5": "no effect on --method adaptive",
     "capture plan.yaml --rig simulated --size nan": "write ROWSxCOLUMNS",
     "capture plan.yaml --rig simulated --until nan": "write a PSNR",

@@ -43,8 +43,6 @@ CSV = "tables.csv"
 Size = tuple[int, int] | None
 VIEWS = (5, 5)
 _ENDINGS = (".h5", ".hdf5")
-UNTRAINED = ("dct", "lambertian")
-"""Kinds of dictionaries that are made by formula."""
 
 
 class TablesSettings(Settings):
@@ -149,7 +147,7 @@ def check_dictionary(
 
 def _trained_on(dictionary: Dictionary) -> list[str] | None:
     """Return the names of the scenes that a dictionary learned from; None when it does not say."""
-    if dictionary.kind in UNTRAINED:
+    if dictionary.kind == "lambertian":  # made by formula
         return []
     try:
         scenes = parse_json(dictionary.provenance, "provenance", ValueError)["scenes"]
