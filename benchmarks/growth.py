@@ -21,7 +21,7 @@ METHODS = {
     "adaptive": {},
     "adaptive-fast": {},
     "tv": {"tv": {"max_steps": 30, "rtol": 1e-12}},
-    "dict-omp": {"sparse": {"solver": {"atoms": 10, "tolerance_factor": 0}}},
+    "dict-admm": {"sparse": {"solver": {"max_steps": 60, "rtol": 1e-12}}},
 }
 """Settings with a fixed number of steps, where a method has any."""
 

@@ -60,7 +60,7 @@ def test_the_picture_shows_centre_view_and_epi_of_every_atom():
     atoms[0] = 1
     for u in range(3):
         atoms[1, 1, u, 2, 1 + u, 0] = 1  # a red dot that moves one pixel per view
-    picture = draw_atoms(Dictionary.normalised(atoms, "dct"))[1::3, 1::3, ::-1]
+    picture = draw_atoms(Dictionary.normalised(atoms, "ksvd"))[1::3, 1::3, ::-1]
     grey, red, white = [128, 128, 128], [255, 128, 128], [255, 255, 255]
     tile_high = 4 + 1 + 3
     assert (picture[:4, :5] == white).all()

@@ -1,7 +1,6 @@
 """A dictionary is a set of light-field patches of unit norm: check it, keep it in a file.
 
-Two kinds need no training: `dct_dictionary`, and `lambertian_dictionary`, which fits any views,
-patch and disparities and codes real patches best of those (see there).
+`lambertian_dictionary` needs no training, and fits any views, patch and disparities.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.model.reading import one_line, stored_arrays
 from emmc_rig.reconstruction.errors import DictionaryError
 
-KINDS = ("ksvd", "online", "dct", "separable", "lambertian")
+KINDS = ("ksvd", "lambertian")
 FORMAT = "emmc-rig dictionary 1"
 REMEDY = "benchmarks/train_dictionary.py makes a dictionary"
 NORM_TOLERANCE = 1e-3
@@ -161,36 +160,6 @@ Textures = NDArray[np.float32]
 """Atoms of one colour: (atom, v, u, y, x)."""
 
 
-def dct_dictionary(
-    views: tuple[int, int],
-    patch: tuple[int, int],
-    frequencies: tuple[int, int, int, int] | None = None,
-    chroma_frequencies: tuple[int, int, int, int] | None = None,
-) -> Dictionary:
-    """Return products of cosines along v, u, y and x, each in every opponent colour.
-
-    Frequency k of an axis of n samples is cos(pi (i + 1/2) k / max(n, frequencies)): the DCT's,
-    orthonormal together, or an overcomplete set when more frequencies than samples are asked for.
-
-    Args:
-        views: rows and columns of views.
-        patch: rows and columns of pixels.
-        frequencies: how many, from 0, along v, u, y, x for the luminance. The default, 3 along v
-            and u and all along y and x, codes real 9x9 patches to 0.1 dB as well as all 6,075.
-        chroma_frequencies: likewise for the chrominances; default 2 and half of the pixels'.
-
-    Raises:
-        DictionaryError: an axis of no samples or frequencies.
-    """
-    _check_patch(views, patch)
-    sizes = *views, *patch
-    counts = frequencies or (*(min(3, n) for n in views), *patch)
-    chroma = chroma_frequencies or (*(min(2, n) for n in views), *(max(1, n // 2) for n in patch))
-    chrominance = _cosines(sizes, chroma)
-    atoms = _coloured(_cosines(sizes, counts), chrominance)
-    return Dictionary.normalised(atoms, "dct")
-
-
 def lambertian_dictionary(
     views: tuple[int, int],
     patch: tuple[int, int],
@@ -302,17 +271,6 @@ def _coloured(luminance: Textures, chrominance: Textures) -> NDArray[np.float32]
     ).astype(np.float32)
 
 
-def _cosines(sizes: Sequence[int], counts: Sequence[int]) -> Textures:
-    """Return the products of cosines of so many frequencies along v, u, y and x."""
-    if len(counts) != 4 or min(counts) < 1:
-        raise DictionaryError(f"frequencies {tuple(counts)}: needs 4 numbers (v, u, y, x), 1 or up")
-    axes = []
-    for n, count in zip(sizes, counts, strict=True):
-        angle = np.pi * (np.arange(n) + 0.5) / max(n, count)
-        axes.append(np.cos(np.arange(count)[:, None] * angle))
-    return np.einsum("av,bu,cy,dx->abcdvuyx", *axes).reshape(-1, *sizes)
-
-
 class _PlaneSamples(NamedTuple):
     """Where in a plane's texture the samples (v, u, y, x) of a patch look, from its middle."""
 
@@ -400,12 +358,10 @@ def _distinct(sets: Sequence[Textures]) -> Textures:
 
 
 def open_dictionary(spec: str | None, views: tuple[int, int], binning: int) -> Dictionary:
-    """Return a dictionary by file, or by the name of one that needs no training.
+    """Return the dictionary of a file, or for None and "lambertian" one of `usual_patch`.
 
-    None takes `lambertian`. Those made here have patches of `usual_patch`. Raises DictionaryError
-    for a file that is none.
+    Raises DictionaryError for a file that is none.
     """
-    if spec in (None, "lambertian", "dct"):
-        make = dct_dictionary if spec == "dct" else lambertian_dictionary
-        return make(views, usual_patch(binning))
+    if spec in (None, "lambertian"):
+        return lambertian_dictionary(views, usual_patch(binning))
     return Dictionary.load(spec)

@@ -94,13 +94,11 @@ class Sensitivity:
     """How much faults of a capture harm a method: factors on the verdict's limits, 1 for TV's.
 
     psi: on those of an error of Psi; methods that assume more than total variation lose 3 dB
-    sooner. bad_pixels: total variation evens out twice as many single wrong readings. one_shot:
-    whether one shot nearly does, because one picture is carried to all views.
+    sooner. bad_pixels: total variation evens out twice as many single wrong readings.
     """
 
     psi: float = 0.7
     bad_pixels: float = 1.0
-    one_shot: bool = False
 
 
 def _no_patches(psi: Psi, settings: ShippedSettings) -> None:

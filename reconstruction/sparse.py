@@ -1,13 +1,11 @@
 """Dictionary-based reconstruction (Section VI-A): a sparse code for every patch, then averaging.
 
-For every patch, min_beta 1/2 |Psi D beta - I|^2 + eta |beta|_1 (eq. 8), or a greedy relative of
-it, with D beta the patch. The sensed dictionary Psi D is built once per patch, or once for all
-patches where mask and colours repeat; the sparse solver runs on it; overlapping patches are
-averaged.
+For every patch, min_beta 1/2 |Psi D beta - I|^2 + eta |beta|_1 (eq. 8), with D beta the patch. The
+sensed dictionary Psi D is built once per patch, or once for all patches where mask and colours
+repeat; ADMM runs on it; overlapping patches are averaged.
 
-Cost of a patch with n atoms, m measurements, N samples x views (and n_c stored colours):
-building 2 n N n_c operations, `admm` n m^2 + 4 n m per pass, `lars` 4 n m per step, `omp` 2 n m
-per atom, `ista`, `fista` and `sl0` 4 n m per step; putting the patch together 2 N c per atom used.
+Cost of a patch with n atoms, m measurements, N samples x views (and n_c stored colours): building
+2 n N n_c operations, ADMM n m^2 + 4 n m per pass, putting together 2 N c per atom used.
 """
 
 from __future__ import annotations
@@ -327,7 +325,7 @@ def reconstruct_sparse(
             "expose shorter or add a shot"
         )
     return Reconstruction(
-        method=f"dict-{settings.solver.method}",
+        method="dict-admm",
         light_field=np.clip(estimates.light_field, 0, 1),
         status=Status.INCOMPLETE if advice else Status.CONVERGED,
         advice="; ".join(advice),

@@ -61,7 +61,7 @@ def pytest_sessionstart(session):
     if config.option.but is not None:  # the run that listed those tests has compiled
         return
     first_run = [sys.executable, "-m", "emmc_rig.commands.first_run"]
-    for together in (("search", "fit"), ("dict-admm", "dict-omp")):
+    for together in (("search", "fit"), ("dict-admm",)):
         with ExitStack() as running:
             processes = [
                 running.enter_context(

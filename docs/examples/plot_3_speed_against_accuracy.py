@@ -17,7 +17,7 @@ frames = camera.expose(scene, seed=0)
 
 emmc.reconstruct(psi, frames, "adaptive")  # the first call compiles kernels
 points = {}
-for method in ("tv", "dict-omp", "tv-dict", "adaptive-fast", "adaptive"):
+for method in ("tv", "dict-admm", "tv-dict", "adaptive-fast", "adaptive"):
     result = emmc.reconstruct(psi, frames, method)
     points[method] = (result.seconds, result.compare(scene)["psnr_db"])
     print(f"{method:14} {points[method][0]:6.2f} s  {points[method][1]:6.2f} dB")

@@ -80,7 +80,7 @@ ClusterOption = Annotated[
 ]
 DictionaryOption = Annotated[
     str | None,
-    typer.Option("--dictionary", help="of methods that need one: lambertian, dct, or a file"),
+    typer.Option("--dictionary", help="of methods that need one: lambertian, or a file"),
 ]
 ScenesOption = Annotated[
     list[str] | None,

@@ -30,7 +30,7 @@ class Settings(BaseModel):
         if not isinstance(data, dict):
             return data
         for name in sorted(set(cls.removed).intersection(data)):
-            text = f"the setting '{name}' was removed in version 0.3 and is ignored"
+            text = f"the setting '{name}' was removed and is ignored"
             warnings.warn(text, RemovedSettingWarning, stacklevel=2)
         kept = {name: value for name, value in data.items() if name not in cls.removed}
         for old, new in cls.renamed.items():

@@ -31,6 +31,7 @@ from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.evidence_kernels import SIZE, Hypotheses, evidence
 from emmc_rig.reconstruction.adaptive.register_tiles import LANES, SIDE
 from emmc_rig.reconstruction.errors import ReconstructionError
+from emmc_rig.reconstruction.inputs import Readings
 
 Array = NDArray[np.floating]
 PROBES = 4
@@ -229,10 +230,7 @@ def _trials(lengths: int, kinds: int, kept: int | None) -> NDArray[np.int64]:
 
 
 def patch_evidence(
-    psi: Psi,
-    data: Array,
-    variance: Array,
-    usable: NDArray[np.bool_],
+    residual: Readings,
     brightness: Array,
     corners: NDArray[np.int64],
     places: NDArray[np.int64],
@@ -243,13 +241,13 @@ def patch_evidence(
 ) -> PatchEvidence:
     """Return how well textures at these disparities explain each patch.
 
-    data: readings less those of the smooth picture, variance: theirs, both (shot, pixel_y,
-    pixel_x). brightness: (patch,), of the smooth picture; sets the amplitudes' scale. corners:
-    (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`. possible: (patch, disparity),
-    those to evaluate (default all): LANES patches in a row share a group, which evaluates every
-    disparity possible for any patch of it. kinds: (patch, length) of texture, where known.
+    residual: readings less those of the smooth picture. brightness: (patch,), of that picture; sets
+    the amplitudes' scale. corners: (patch, 2) pixels, places: (reading, 3), see `EvidencePatches`.
+    possible: (patch, disparity), those to evaluate (default all): LANES patches in a row share a
+    group, which evaluates every disparity possible for any patch of it. kinds: (patch, length) of
+    texture, where known.
     """
-    count = len(corners)
+    psi, count = residual.psi, len(corners)
     if possible is None:
         possible = np.ones((count, len(disparities)), dtype=bool)
     padded = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
@@ -277,9 +275,9 @@ def patch_evidence(
     given = Hypotheses(
         psi.weights,
         psi.colour_map,
-        usable,
-        np.asarray(data, np.float32),
-        np.asarray(variance, np.float32),
+        residual.usable,
+        np.asarray(residual.frames, np.float32),
+        np.asarray(residual.noise, np.float32),
         places,
         psi.binning,
         waves,

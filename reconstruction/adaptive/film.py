@@ -19,7 +19,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,34 +244,6 @@ class Followed:
         return self.parameters["flow_px"] < RESTING_PX
 
 
-class CarriedScene(NamedTuple):
-    """The surfaces of the frame before, carried to the present along a flow.
-
-    Attributes:
-        centre: disparity of the present centre view (y, x), padded.
-        texture: (c, y, x), padded.
-        missed: the present frame less what they predict, over the scale, (shot, pixel_y, pixel_x).
-    """
-
-    centre: Array
-    texture: Array
-    missed: Array
-
-
-class Motion(NamedTuple):
-    """Flows between the frame before and the present one.
-
-    Attributes:
-        there: flow from the frame before to the present one, (y, x, 2).
-        back: flow from the present frame to the one before, (y, x, 2).
-        scene: the surfaces, carried along `back`.
-    """
-
-    there: Array
-    back: Array
-    scene: CarriedScene
-
-
 def followed(
     film: Film,
     given: Readings,
@@ -292,9 +263,8 @@ def followed(
     margin, nearer = before.margin, 1 if settings.nearer == "larger" else -1
     plain = plain_of(given, before.scale, unseen_by(given), settings.start_steps)
     bright, used = plain.bright, given.usable & ~plain.held
-    there, back, carried_scene = _motion(before, plain, used, nearer)
-    centre, texture = carried_scene.centre, carried_scene.texture
-    new = _share_new(carried_scene.missed, plain)
+    there, back, (centre, texture, missed) = _motion(before, plain, used, nearer)
+    new = _share_new(missed, plain)
     if new > NEW_SHARE:
         return None
     earlier = [frame.since(there, back) for frame in before.earlier[-own.earlier :]]
@@ -338,32 +308,37 @@ def followed(
     )
 
 
-def _motion(before: Known, plain: Plain, used: NDArray[np.bool_], nearer: int) -> Motion:
-    """Return the flow since the frame before, and the scene it carries.
+def _motion(
+    before: Known, plain: Plain, used: NDArray[np.bool_], nearer: int
+) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Return the flows since the frame before and back, (y, x, 2), and the scene carried.
+
+    Of the scene: disparity of the present centre view (y, x) and texture (c, y, x), both padded;
+    and the present frame less what these predict, over the scale, (shot, pixel_y, pixel_x).
 
     A place flows where the squared residual of the scene carried without flow exceeds STILL times
     that of the scene carried with it, in the mean around. used: readings that are fitted.
     """
     bright = plain.bright
 
-    def carried_along(back: Array) -> CarriedScene:
+    def carried_along(back: Array) -> tuple[Array, Array, Array]:
         at = at_places(before.centre.shape) + padded(back, before.margin)
         centre = sampled(before.centre, at)
         texture = np.stack([sampled(colour, at, cubic=True) for colour in before.texture])
         surfaces = surfaces_of(bright.psi, centre, before.margin, nearer, len(texture))
-        return CarriedScene(centre, texture, bright.frames - surfaces.forward(texture))
+        return centre, texture, bright.frames - surfaces.forward(texture)
 
     there, back = flow_between(before.earlier[-1].picture, plain.picture)
     scene, unmoved = carried_along(back), carried_along(np.zeros_like(back))
     missed, missed_unmoved = (
-        mean_around(np.square(carried.missed), used.astype(np.float32)).sum(axis=0)
-        for carried in (scene, unmoved)
+        mean_around(np.square(left), used.astype(np.float32)).sum(axis=0)
+        for *_, left in (scene, unmoved)
     )
     flows = missed_unmoved > STILL * missed
     if not flows.all():
         there, back = rested(there, back, (~flows).astype(np.float32))
         scene = carried_along(back)
-    return Motion(there, back, scene)
+    return there, back, scene
 
 
 def _models(before: Known, plain: Plain, scene: FittedScene, back: Array) -> Fits:

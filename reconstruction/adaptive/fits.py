@@ -207,9 +207,10 @@ def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
     else:
         shares = np.zeros((len(fits.residuals), *held.shape[1:]), dtype=np.float32)
         shares[0] = 1
-    together = mixture.averaged(fits.light_fields, shares, given.psi.binning, survey.plain)
+    models = fits.light_fields, shares, given.psi.binning, survey.plain
+    light_field, spread_by_sample, apart = mixture.averaged(*models)
     fits.light_fields.clear()
-    light_field, spread = together.light_field, float(together.spread.mean(dtype=np.float64))
+    spread = float(spread_by_sample.mean(dtype=np.float64))
     if not held.any():
         return Mean(light_field, shares, None)
     residual = np.asarray(sum(s * missed for s, missed in zip(shares, fits.residuals, strict=True)))
@@ -218,15 +219,15 @@ def averaged(survey: Plain, fits: Fits, disparity_sigma: Array) -> Mean:
     )
     over_plain = excess / max(its_own, 1e-20)
     variance = variance_of_mean(
-        fits.scene, survey.scale, together.spread, residual, given.noise, held
+        fits.scene, survey.scale, spread_by_sample, residual, given.noise, held
     )
     if variance is None:
         return Mean(light_field, shares, None, over_plain)
-    blur_views(together.apart)
+    blur_views(apart)
     # The residuals, on which it is calibrated, show neither.
-    _add(variance, survey.unseen, over_plain / (1 + over_plain), together.apart)
+    _add(variance, survey.unseen, over_plain / (1 + over_plain), apart)
     of_samples = float(variance.mean(dtype=np.float64))
-    between = float(together.apart.mean(dtype=np.float64))
+    between = float(apart.mean(dtype=np.float64))
     of = features(of_samples, between, spread, disparity_sigma, light_field)
     times, reported = stated(of)
     variance *= times * fits.understated

@@ -17,7 +17,6 @@ How far the models differ from their mean, place by place, says where it is in d
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -145,28 +144,16 @@ def values(levels: NDArray[np.uint16]) -> NDArray[np.float32]:
     return np.multiply(levels, np.float32(1 / LEVELS), dtype=np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class Together:
-    """The mean of models, and how they differ.
-
-    Attributes:
-        light_field: the mean, (v, u, y, x, c).
-        spread: variance of the models about it, (v, u, y, x), averaged over colours.
-        apart: squared difference between the mean and another light field, of this shape.
-    """
-
-    light_field: NDArray[np.float32]
-    spread: NDArray[np.float32]
-    apart: NDArray[np.float32]
-
-
 def averaged(
     models: Sequence[NDArray[np.uint16]],
     shares: Array,
     binning: int,
     other: NDArray[np.uint16],
-) -> Together:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Return the mean of light fields (v, u, y, x, c), and how they differ.
+
+    Second, the variance of the models about it, and third, the squared difference between the mean
+    and another light field; both (v, u, y, x), averaged over colours.
 
     models: as `stored`. shares: see `shares_of`. other: the light field that the mean is compared
     with, stored.
@@ -195,4 +182,4 @@ def averaged(
         apart[at] = square(values(other[at]).reshape(rows, -1), of_view)
 
     in_views(work, mean.shape[:2])
-    return Together(mean, spread, apart)
+    return mean, spread, apart

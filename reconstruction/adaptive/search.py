@@ -173,7 +173,7 @@ class Volume:
         evidence: log-likelihoods, (row, column, disparity), -inf where excluded.
         kind: of the texture, an index of `TexturePrior.kinds`, (row, column).
         decisive: whether the patch's own evidence prefers any disparity, (row, column).
-        at_end: share of deciding patches at the range's ends.
+        at_end: share of deciding patches at the range's ends, the two last disparities of a side.
         between: the same for a second grid, between these patches, of the same disparities.
     """
 
@@ -204,18 +204,9 @@ def evidence_at(
     """Return the evidence of the patches at corners (patch, 2), in pixels; see `patch_evidence`."""
     half = ((patches.side - 1) * patches.spacing) // 2
     bright = data.brightness[corners[:, 0] + half, corners[:, 1] + half]
+    places = patches.places(data.psi.shots)
     return patch_evidence(
-        data.psi,
-        data.residual.frames,
-        data.residual.noise,
-        data.residual.usable,
-        bright,
-        corners,
-        patches.places(data.psi.shots),
-        disparities,
-        prior,
-        possible,
-        kinds,
+        data.residual, bright, corners, places, disparities, prior, possible, kinds
     )
 
 
@@ -223,6 +214,21 @@ def _deciding(evidence: Array) -> NDArray[np.bool_]:
     """Return which patches decide, of evidence (..., disparity), see DECISIVE."""
     mean = evidence.mean(axis=-1, where=np.isfinite(evidence))
     return evidence.max(axis=-1) - mean > DECISIVE
+
+
+def _at_ends(
+    probability: Array,
+    disparities: Array,
+    deciding: NDArray[np.bool_],
+    ends: tuple[float, float],
+) -> list[float]:
+    """Return the shares of the deciding patches whose likeliest disparity lies at either end.
+
+    ends: the second and the last but one of the disparities searched.
+    """
+    best = disparities[probability.argmax(axis=-1)][deciding]
+    at_ends = best <= ends[0], best >= ends[1]
+    return [float(np.mean(there)) if best.size else 0.0 for there in at_ends]
 
 
 def _steps(first_px: float, last_px: float, step_px: float) -> NDArray[np.float64]:
@@ -261,11 +267,7 @@ def coarse(data: SearchData, prior: TexturePrior, settings: AdaptiveSettings) ->
             known, settings.slope_px * patches.stride, settings.jump, _spacing(known)
         )
         chances = posteriors(evidence, pairs)
-        best = chances.argmax(axis=-1)[deciding]
-        at_ends = [
-            float(np.mean(there)) if best.size else 0.0
-            for there in (best <= 1, best >= len(known) - 2)
-        ]
+        at_ends = _at_ends(chances, known, deciding, (known[:2][-1], known[-2:][0]))
         below, above = (
             _steps(end, min(end + START_PX, furthest_px), FAR_STEP_PX)
             if share > POSSIBLE
@@ -349,21 +351,22 @@ def fine(
     # Where patches overlap they count the same readings again.
     own = np.float32((patches.stride / side) ** 2)
     pairs = compatibility(labels[used], settings.slope_px * patches.stride, settings.jump)
-    half = (side - 1) / 2
+    half, last = (side - 1) / 2, (low + step_px, high - step_px)
     between = None
     for grid, wanted in zip(reversed(grids), reversed(asked), strict=True):
         evidence, kind, decisive = _on_grid(data, patches, grid, prior, labels, every, wanted)
         evidence = evidence[..., used]
         evidence[~decisive] = _extended(evidence[~decisive])
         likely = evidence - np.where(decisive[..., None], np.float32(0), rare)
+        chances = posteriors(likely * own, pairs)
         between = Volume(
             disparities=labels[used],
             centres=(grid[0] + half, grid[1] + half),
-            probability=posteriors(likely * own, pairs),
+            probability=chances,
             evidence=evidence,
             kind=kind,
             decisive=decisive,
-            at_end=rough.at_end,
+            at_end=max(_at_ends(chances, labels[used], decisive, last)),
             between=between,
         )
     assert between is not None

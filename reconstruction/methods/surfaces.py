@@ -17,7 +17,7 @@ from emmc_rig.reconstruction.adaptive.method import (
 )
 from emmc_rig.reconstruction.adaptive.settings import AdaptiveSettings, fast
 from emmc_rig.reconstruction.dictionary import lambertian_dictionary, planes_of_scene, usual_patch
-from emmc_rig.reconstruction.method import Given, Method, Sensitivity, ShippedSettings, cost_words
+from emmc_rig.reconstruction.method import Given, Method, ShippedSettings, cost_words
 from emmc_rig.reconstruction.methods.variational import solve_tv_dict
 from emmc_rig.reconstruction.result import Reconstruction
 from emmc_rig.reconstruction.sparse import SparseSettings
@@ -126,7 +126,6 @@ METHODS = (
         "adaptive",
         AdaptiveSettings,
         films=True,
-        sensitivity=Sensitivity(one_shot=True),
         factor=3.5,
         scout="adaptive-fast",
         patches=_patches,
@@ -141,7 +140,6 @@ METHODS = (
         "adaptive",
         AdaptiveSettings,
         films=True,
-        sensitivity=Sensitivity(one_shot=True),
         factor=1.0,
         scout="adaptive-fast",
     ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -139,31 +139,21 @@ def judged_together(blocks: Sequence[JudgedBlock]) -> Verdict:
     blocks: at least one.
     """
     whole = verdict_from(combined(blocks))
-    reasons = list(whole.reasons)
     levels: tuple[Level, ...] = ("do not use", "doubt")
     for level in levels:
-        bad = [block for block in blocks if _rank(block.verdict.level) >= _rank(level)]
+        rank = LEVELS.index(level)
+        bad = [block for block in blocks if LEVELS.index(block.verdict.level) >= rank]
         share = len(bad) / len(blocks)
         if share <= (DOUBTED_SHARE if level == "doubt" else 0) or len(blocks) == 1:
             continue
-        level_of_share = level if share > REFUSED_SHARE else "doubt"
-        if _rank(level) <= _rank(whole.level):
+        if rank <= LEVELS.index(whole.level):
             continue
-        worst = max(bad, key=lambda block: _rank(block.verdict.level))
+        worst = max(bad, key=lambda block: LEVELS.index(block.verdict.level))
         reason = worst.verdict.reasons[0]
-        reasons.append(
-            Reason(
-                f"{len(bad)} of {len(blocks)} blocks are worse than the whole, as that from row "
-                f"{worst.row}, column {worst.column}: {reason.what}",
-                share,
-                reason.remedy,
-                level_of_share,
-            )
+        words = (
+            f"{len(bad)} of {len(blocks)} blocks are worse than the whole, as that from row "
+            f"{worst.row}, column {worst.column}: {reason.what}"
         )
-        break
-    reasons.sort(key=lambda reason: -_rank(reason.level))
-    return replace(whole, level=reasons[0].level if reasons else "trust", reasons=tuple(reasons))
-
-
-def _rank(level: str) -> int:
-    return LEVELS.index(level)  # type: ignore[arg-type]
+        level_of_share = level if share > REFUSED_SHARE else "doubt"
+        return whole.with_reasons([Reason(words, share, reason.remedy, level_of_share)])
+    return whole

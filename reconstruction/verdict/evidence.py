@@ -21,8 +21,13 @@ from emmc_rig.reconstruction.verdict.displaced import displaced
 from emmc_rig.reconstruction.verdict.kept import compare_held_out, over_baselines
 from emmc_rig.reconstruction.verdict.orientation import WEAK, seen_masks
 from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
-from emmc_rig.reconstruction.verdict.shadow import Relief, measured_relief, shadow
-from emmc_rig.reconstruction.verdict.shots import Motion, compared
+from emmc_rig.reconstruction.verdict.shadow import (
+    Relief,
+    cross_strength,
+    measured_relief,
+    shadow,
+)
+from emmc_rig.reconstruction.verdict.shots import Motion, brightness
 
 Array = NDArray[np.floating]
 CLIPPED = 0.5
@@ -44,7 +49,7 @@ class Evidence:
     relief: float  #: root mean square of what the masks add to the readings, over them
     strengths: tuple[float | None, ...]  #: of the masks' shadow in each shot, 1 where Psi is right
     strength_errors: tuple[float | None, ...]  #: their standard deviations
-    other_strengths: tuple[tuple[float | None, ...], ...]  #: (read, said), see `ShotAgreement`
+    other_strengths: tuple[tuple[float | None, ...], ...]  #: (read, said), see `cross_strength`
     displaced_px: float | None  #: root mean square displacement of the shadow
     changes: dict[str, tuple[float | None, ...]]  #: fields of `displaced.Change`, by cause
     brightness: tuple[float | None, ...]  #: of each shot, over the shots' mean
@@ -157,7 +162,6 @@ def gathered(
         given = psi, frames, residual, noise_sigma, usable, fitted.kept
         baselines = beside.submit(over_baselines, *given)
         off = displaced(psi, relief)
-    shots = compared(relief)
     mean = max(float(np.mean(frames[usable], dtype=np.float64)), 1e-12)
     step = quantised(frames, usable)
     return Evidence(
@@ -168,10 +172,10 @@ def gathered(
         relief=masks.relief,
         strengths=_plain(masks.strength),
         strength_errors=_plain(masks.error),
-        other_strengths=tuple(_plain(row) for row in shots.masks),
+        other_strengths=tuple(_plain(row) for row in cross_strength(relief)),
         displaced_px=off.size_px,
         changes={name: _plain(astuple(change)) for name, change in off.changes.items()},
-        brightness=_plain(shots.brightness),
+        brightness=_plain(brightness(relief)),
         **({} if moved is None else moved.figures()),
         bad=fitted.bad,
         **pixel_figures(fitted.excluded, relief, usable),

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.problem import choose_mu
 from emmc_rig.reconstruction.tv import few_steps
-from emmc_rig.reconstruction.verdict.readings import neighbours
 from emmc_rig.reconstruction.verdict.shadow import Relief
 
 Array = NDArray[np.floating]
@@ -122,14 +121,20 @@ def over_baselines(
 
 
 def _off_neighbours(psi: Psi, frames: Array, good: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return what readings differ by from the mean of those beside, (shot, pixel_y, pixel_x)."""
+    """Return what readings differ by from the mean of the good ones of the eight beside.
+
+    Of a Bayer colour the next pixel is two further. (shot, pixel_y, pixel_x) each.
+    """
     step = 1 if psi.colour is None or psi.binning > 1 else 2
-    return np.stack(
-        [
-            frame - neighbours(frame, of_shot, step).mean(axis=0)
-            for frame, of_shot in zip(frames, good, strict=True)
-        ]
-    )
+    beside = np.zeros((2 * step + 1, 2 * step + 1))
+    beside[::step, ::step] = 1
+    beside[step, step] = 0
+    off = []
+    for frame, of_shot in zip(frames, good, strict=True):
+        light = np.where(of_shot, frame, 0).astype(np.float64)
+        total, count = (cv2.filter2D(a, -1, beside) for a in (light, of_shot.astype(np.float64)))
+        off.append(frame - total / np.maximum(count, 1))
+    return np.asarray(off, dtype=np.float32)
 
 
 def _surely_over(mine: Array, theirs: Array) -> float:

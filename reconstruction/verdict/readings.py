@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dctn
 
 from emmc_rig.reconstruction.verdict.shadow import Relief
 
@@ -57,31 +58,6 @@ def _saturated(excluded: Array, relief: Relief, usable: NDArray[np.bool_]) -> fl
     return above / usable.size
 
 
-def neighbours(values: Array, good: NDArray[np.bool_], step: int) -> NDArray[np.float32]:
-    """Return the eight neighbours of each pixel, (8, y, x).
-
-    Those that are not good have the others' mean. step: 1, or 2 to the next pixel of a Bayer
-    colour.
-    """
-    rows, columns = values.shape
-    padded = np.pad(np.where(good, values, np.nan), step, mode="reflect")
-    places = [(i, j) for i in (0, step, 2 * step) for j in (0, step, 2 * step)]
-    places.remove((step, step))
-    beside = np.stack([padded[i : i + rows, j : j + columns] for i, j in places])
-    known = np.isfinite(beside)
-    mean = np.where(known, beside, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return np.where(known, beside, mean).astype(np.float32)
-
-
-def _cosines() -> NDArray[np.float64]:
-    """Return the orthonormal cosine transform of a block's rows, (frequency, sample)."""
-    k = np.arange(BLOCK_PX)
-    rows = np.cos(np.pi * (2 * k[None] + 1) * k[:, None] / (2 * BLOCK_PX))
-    rows *= np.sqrt(2 / BLOCK_PX)
-    rows[0] /= np.sqrt(2)
-    return rows
-
-
 def blockiness(frames: Array, usable: NDArray[np.bool_]) -> float | None:
     """Return the contrast between coefficients of the most compressed raster of blocks and of the
     others.
@@ -107,8 +83,8 @@ def _smallness(frame: Array, good: NDArray[np.bool_]) -> float:
     if len(blocks) < FEWEST_BLOCKS:
         return np.nan
     # The first coefficient is the mean: brightness, no detail.
-    cosines = _cosines()
-    sizes = np.abs(cosines @ blocks @ cosines.T).reshape(len(blocks), -1)[:, 1:]
+    coefficients = np.asarray(dctn(blocks, axes=(1, 2), norm="ortho"))
+    sizes = np.abs(coefficients).reshape(len(blocks), -1)[:, 1:]
     typical = np.sqrt(np.mean(np.square(sizes), axis=0)) + 1e-30
     return float(np.log(sizes / typical + NOTHING).mean())
 

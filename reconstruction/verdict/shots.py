@@ -7,13 +7,13 @@ in single shots: whole spots change their brightness.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from emmc_rig.reconstruction.verdict.shadow import Relief, cross_strength, shadow
+from emmc_rig.reconstruction.verdict.shadow import Relief, shadow
 
 Array = NDArray[np.floating]
 SPOT_PX = 1.5
@@ -60,18 +60,8 @@ class Motion:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class ShotAgreement:
-    """brightness: of every shot over their mean. masks: (read, said), how strongly each shot's
-    readings show each shot's masks.
-    """
-
-    brightness: NDArray[np.float64]
-    masks: NDArray[np.float64]
-
-
-def compared(relief: Relief) -> ShotAgreement:
-    """Return how the shots agree."""
+def brightness(relief: Relief) -> NDArray[np.float64]:
+    """Return the brightness of every shot over their mean."""
     kept = np.flatnonzero(relief.good.any(axis=(1, 2)))
     common = relief.good[kept].all(axis=0)
     ratio = np.ones(len(relief.good))
@@ -81,7 +71,7 @@ def compared(relief: Relief) -> ShotAgreement:
             read = level * (1 + relief.read[shot][common])
             said = level * (1 + relief.masks[shot][common])
             ratio[shot] = read.sum() / max(said.sum(), 1e-12)
-    return ShotAgreement(ratio / ratio[kept].mean() if len(kept) else ratio, cross_strength(relief))
+    return ratio / ratio[kept].mean() if len(kept) else ratio
 
 
 def motion(relief: Relief, residual: Array, noise_sigma: float) -> Motion | None:
@@ -93,12 +83,9 @@ def motion(relief: Relief, residual: Array, noise_sigma: float) -> Motion | None
     shots = np.flatnonzero(relief.good.any(axis=(1, 2)))
     if len(shots) < 2 or not shadow(relief).strength[shots].min() > LEAST_STRENGTH:
         return None
-    differences = _differences(relief, residual, shots, noise_sigma)
-    apart = differences.apart
+    apart, expected, least = _differences(relief, residual, shots, noise_sigma)
     ratios = {
-        side: _windows(apart, side)
-        / np.maximum(_windows(differences.expected, side), differences.least)
-        / limit
+        side: _windows(apart, side) / np.maximum(_windows(expected, side), least) / limit
         for side, limit in MOVED.items()
     }
     # Small windows place best.
@@ -129,23 +116,12 @@ def motion(relief: Relief, residual: Array, noise_sigma: float) -> Motion | None
     )
 
 
-class Differences(NamedTuple):
-    """Squares by which shots differ in spots, in squared readings.
-
-    apart, expected: measured, and expected of noise and missing texture, (shot, pixel_y, pixel_x).
-    least: that is expected anywhere.
-    """
-
-    apart: Array
-    expected: Array
-    least: float
-
-
 def _differences(
     relief: Relief, residual: Array, shots: NDArray[np.intp], noise_sigma: float
-) -> Differences:
-    """Return by how much shots differ in spots, and by how much they may.
+) -> tuple[Array, Array, float]:
+    """Return squared differences between shots in spots: measured, expected, least expected.
 
+    The first two are (shot, pixel_y, pixel_x); all in squared readings.
     Of readings m that are expected, the residual is a m + e, with `a` by least squares over a spot,
 
         a = sum(m residual) / sum(m^2),
@@ -170,7 +146,7 @@ def _differences(
     noise = min(float(alone.mean()), noise_sigma**2)
     least = max(noise, (UNSURE * float(expected[good].mean())) ** 2, 1e-20)
     share = 1 / (4 * np.pi * SPOT_PX**2)
-    return Differences(apart, share * alone, share * least)
+    return apart, share * alone, share * least
 
 
 def _differing(squares: NDArray[np.floating], shots: NDArray[np.intp]) -> int | None:

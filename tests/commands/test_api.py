@@ -147,7 +147,7 @@ def test_frames_are_arrays_to_numpy(taken):
 
 def test_a_result_is_saved_as_the_command_saves_it(taken, tmp_path):
     _, psi, frames = taken
-    result = emmc.reconstruct(psi, frames, "dict-omp", dictionary="dct")
+    result = emmc.reconstruct(psi, frames, "dict-admm", dictionary="lambertian")
     result.save(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "files.json",
@@ -160,7 +160,7 @@ def test_a_result_is_saved_as_the_command_saves_it(taken, tmp_path):
     }
     saved = load_hdf5(tmp_path / "out" / "light_field.h5")
     np.testing.assert_array_equal(saved, result.light_field)
-    assert result.metrics()["dictionary"] == "dct"
+    assert result.metrics()["dictionary"] == "lambertian"
     assert result.sigma is None
     assert result.disparity is None
 
@@ -340,7 +340,7 @@ MISTAKES = {
     "noise as text": (lambda t: api.reconstruct(t[1], t[2], noise_sigma="a"), "noise_sigma: got"),
     "usable as a list": (lambda t: api.reconstruct(t[1], t[2], usable=[True]), "usable: got list"),
     "a dictionary of a number": (
-        lambda t: api.reconstruct(t[1], t[2], "dict-omp", dictionary=3),
+        lambda t: api.reconstruct(t[1], t[2], "dict-admm", dictionary=3),
         "dictionary: got 3",
     ),
     "a step that is no function": (

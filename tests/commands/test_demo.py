@@ -148,16 +148,14 @@ def test_three_shots_of_a_real_light_field_beat_the_copied_centre_view(tmp_path)
 @pytest.mark.slow
 def test_the_loop_reconstructs_with_a_dictionary(tmp_path):
     name = "rgbw-bayer-2shots"
-    settings = DemoSettings(
-        "near-planar", name, find_camera(name), (24, 32), method="dict-omp", dictionary="dct"
-    )
+    settings = DemoSettings("near-planar", name, find_camera(name), (24, 32), method="dict-admm")
     metrics = run_demo(settings, tmp_path)
-    assert metrics["method"] == "dict-omp"
+    assert metrics["method"] == "dict-admm"
     assert metrics["parameters"]["patches"] > 10
 
 
 def test_a_method_that_is_not_known_is_reported_before_anything_is_captured(tmp_path):
-    settings = DemoSettings("near-planar", "rgbw-mono", find_camera("rgbw-mono"), method="dict-ump")
-    with pytest.raises(ReconstructionError, match="did you mean 'dict-omp'"):
+    settings = DemoSettings("near-planar", "rgbw-mono", find_camera("rgbw-mono"), method="dict-adm")
+    with pytest.raises(ReconstructionError, match="did you mean 'dict-admm'"):
         run_demo(settings, tmp_path)
     assert not any(tmp_path.iterdir())

@@ -68,13 +68,13 @@ def test_a_run_that_fails_leaves_no_process(started):
         return x / 2
 
     def stopped():
-        with first_run.helped_to_compile("dict-omp", "rgbw-mono", None):
+        with first_run.helped_to_compile("dict-admm", "rgbw-mono", None):
             half(3.0)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         stopped()
-    assert parts(started) == [["dict-omp", "rgbw-mono"]]
+    assert parts(started) == [["dict-admm", "rgbw-mono"]]
     assert started[0][1].poll() is not None
 
 

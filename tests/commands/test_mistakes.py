@@ -153,7 +153,7 @@ ONE_LINE = {
         "one mask"
     ),
     "stability --fast --scene dark --scene dark": "two scenes are called 'dark'",
-    "stability --fast --method dict-omp --dictionary none.h5": "none.h5",
+    "stability --fast --method dict-admm --dictionary none.h5": "none.h5",
     "chart --fast --method tv --method tv-dic": "did you mean 'tv-dict'",
     "chart --fast --method tv --scene nowhere": "no scene 'nowhere'",
     "chart --fast --method tv --scene dark --scene ./dark": "two scenes are called 'dark'",
@@ -183,7 +183,7 @@ WRONG_USAGE = {
     "demo --shots 0": "",
     "demo --size tiny": "192x256",
     "demo --dictionary nothing.h5": "no effect on --method adaptive",
-    "demo --method adaptive --dictionary dct": "--dictionary",
+    "demo --method adaptive --dictionary lambertian": "--dictionary",
     "reconstruct taken --dictionary nothing.h5": "no effect on --method adaptive",
     "capture plan.yaml --rig simulated --size nan": "write ROWSxCOLUMNS",
     "capture plan.yaml --rig simulated --until nan": "write a PSNR",

@@ -47,7 +47,7 @@ def test_a_psi_says_which_views_it_measures(psi):
     np.testing.assert_array_equal(measured_views(nameless), measured)
 
 
-@pytest.mark.parametrize("method", ["adaptive-fast", "tv", "tv-dict", "dict-lars"])
+@pytest.mark.parametrize("method", ["adaptive-fast", "tv", "tv-dict", "dict-admm"])
 def test_every_method_fills_in_the_views_that_no_light_comes_from(psi, scene, method):
     result = emmc.reconstruct(psi, psi @ scene, method, noise_sigma=0.01)
     assert np.isfinite(result.light_field).all()

@@ -67,9 +67,9 @@ def test_the_evidence_is_the_log_likelihood_of_a_dense_student_t(coded_psi, cfa,
     prior = TexturePrior(kinds=((0.04, 0.1),))
     patches = EvidencePatches(4, 2)
     corner, bright, disparities = np.array([[1, 2]]), np.array([0.5]), np.array([-1.0, 0.3])
-    found = patch_evidence(
-        psi, data, variance, usable, bright, corner, patches.places(shots), disparities, prior
-    )
+    residual = Readings(psi, data, 0.0, variance, usable)
+    places = patches.places(shots)
+    found = patch_evidence(residual, bright, corner, places, disparities, prior)
     rows = np.zeros(psi.frames_shape, dtype=bool)
     rows[:, 1:5, 2:6] = True
     rows &= usable
@@ -97,10 +97,7 @@ def evidence_of_patches(psi, prior, **given):
     corners = np.stack(np.meshgrid(*patches.grid(data.shape[1:]), indexing="ij"), axis=-1)
     corners = corners.reshape(-1, 2)
     found = patch_evidence(
-        psi,
-        data,
-        np.full(data.shape, 1e-4),
-        np.ones(data.shape, bool),
+        Readings(psi, data, 0.01, np.full(data.shape, 1e-4), np.ones(data.shape, bool)),
         np.full(len(corners), 0.5),
         corners,
         patches.places(psi.shots),
@@ -127,8 +124,9 @@ def test_patches_behind_a_coded_aperture_share_covariances(random_psi, monkeypat
 
     def found():
         return patch_evidence(
-            psi, data, np.full(data.shape, 1e-4), usable, np.full(len(corners), 0.5), corners,
-            patches.places(2), np.linspace(-1, 1, 7), prior, asked,
+            Readings(psi, data, 0.01, np.full(data.shape, 1e-4), usable),
+            np.full(len(corners), 0.5), corners, patches.places(2), np.linspace(-1, 1, 7), prior,
+            asked,
         )  # fmt: skip
 
     shared = found()
@@ -204,8 +202,8 @@ def test_readings_that_repeat_each_other_without_noise_have_finite_evidence(code
     patches = EvidencePatches(4, 3)
     zero, corner = np.zeros(psi.frames_shape, np.float32), np.array([[1, 2]])
     found = patch_evidence(
-        psi, zero, zero, zero == 0, np.ones(1), corner, patches.places(2), np.zeros(1),
-        TexturePrior(),
+        Readings(psi, zero, 0.0, zero, zero == 0), np.ones(1), corner, patches.places(2),
+        np.zeros(1), TexturePrior(),
     )  # fmt: skip
     assert np.isfinite(found.log_likelihood).all()
 
@@ -433,6 +431,17 @@ def test_a_mask_that_treats_all_views_alike_decides_nothing():
     truth, _ = plane_scene(pinhole, 0.0, seed=1)
     found = reconstruct_adaptive(pinhole, even_frames(pinhole.forward(truth), 0.003), quick())
     assert found.parameters["decided"] < 0.25
+
+
+@pytest.mark.parametrize(("furthest_px", "low", "high"), [(24.0, 0.0, 0.01), (0.5, 0.5, 1.0)])
+def test_a_scene_beyond_the_range_searched_is_at_its_end(bayer, planted, furthest_px, low, high):
+    """A plane at 0.7 px per view; the share is that of the fine search, not of the coarse one."""
+    _, frames, sigma, _ = planted
+    given = checked(bayer, even_frames(frames, sigma))
+    settings = AdaptiveSettings(furthest_px=furthest_px)
+    survey = surveyed(given, settings, None, lambda _: None)
+    rough = replace(survey.rough, at_end=0.25)
+    assert low <= search.fine(survey.data, survey.prior, rough, settings).at_end <= high
 
 
 def test_weak_textures_that_prefer_no_disparity_do_not_make_the_evidence_flat():

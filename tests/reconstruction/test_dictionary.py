@@ -8,7 +8,6 @@ from emmc_rig.reconstruction.dictionary import (
     KINDS,
     OPPONENT,
     Dictionary,
-    dct_dictionary,
     lambertian_dictionary,
     plane_disparities,
     planes_of_scene,
@@ -59,7 +58,7 @@ def with_atom(number, value):
         (Dictionary, with_atom(4, np.nan), "ksvd", "atom 4"),
         (Dictionary, with_atom(3, np.inf), "ksvd", "atom 3"),
         (Dictionary, with_atom(2, 0), "ksvd", "atom 2"),
-        (Dictionary, lambda a: a, "kvsd", "separable"),
+        (Dictionary, lambda a: a, "kvsd", "ksvd, lambertian"),
         (Dictionary.normalised, with_atom(1, 0), "ksvd", "atom 1 is zero"),
     ],
 )
@@ -153,33 +152,16 @@ def test_a_file_that_holds_no_dictionary_is_refused(some, tmp_path, spoil, words
         Dictionary.load(path)
 
 
-def test_all_cosines_are_an_orthonormal_basis():
-    full = (*VIEWS, *PATCH)
-    matrix = dct_dictionary(VIEWS, PATCH, full, full).matrix.astype(np.float64)
-    assert matrix.shape == (360, 360)
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(360), atol=2e-7)
-
-
-def test_the_default_cosines_are_orthonormal_and_hold_the_flat_patches():
-    matrix = dct_dictionary((5, 5), (9, 9)).matrix.astype(np.float64)
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=2e-6)
-    for colour in np.eye(3):
-        flat = np.broadcast_to(colour, (5, 5, 9, 9, 3)).ravel()
-        np.testing.assert_allclose(matrix.T @ (matrix @ flat), flat, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
         (((0, 5), (9, 9)), "0x5 views"),
         (((5, 5), (9, 0)), "9x0 pixels"),
-        (((5, 5), (9, 9), (1, 1, 1)), "4 numbers"),
-        (((5, 5), (9, 9), (1, 1, 1, 0)), "4 numbers"),
     ],
 )
-def test_cosines_of_nothing_are_refused(arguments, reported):
+def test_patches_of_nothing_are_refused(arguments, reported):
     with pytest.raises(DictionaryError, match=reported):
-        dct_dictionary(*arguments)
+        lambertian_dictionary(*arguments)
 
 
 @pytest.mark.parametrize("disparity", [-1, 0, 1, 2])
@@ -240,8 +222,7 @@ def test_planes_are_one_pixel_apart_in_the_outermost_view():
 @pytest.mark.slow
 @pytest.mark.parametrize(("views", "patch"), [((2, 2), (4, 6)), ((7, 7), (8, 8)), ((9, 9), (3, 3))])
 def test_the_defaults_fit_any_views_and_patch(views, patch):
-    for make in (dct_dictionary, lambertian_dictionary):
-        assert make(views, patch).patch_shape == (*views, *patch, 3)
+    assert lambertian_dictionary(views, patch).patch_shape == (*views, *patch, 3)
 
 
 @pytest.mark.parametrize("disparities", [[], [np.nan], [0, np.inf], [5]])

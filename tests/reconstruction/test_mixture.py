@@ -78,8 +78,8 @@ def test_the_mean_of_light_fields_follows_the_shares_of_pixels():
     shares = np.stack([np.full((2, 3), 0.25), np.full((2, 3), 0.75)]).astype(np.float32)
     fields = [np.full((3, 3, 4, 6, 3), value, np.float32) for value in (0.4, 0.8)]
     fields = [stored(field) for field in fields]
-    together = averaged(fields, shares, 2, fields[1])
-    np.testing.assert_allclose(together.light_field, 0.7, rtol=2e-5)
+    mean, _, _ = averaged(fields, shares, 2, fields[1])
+    np.testing.assert_allclose(mean, 0.7, rtol=2e-5)
 
 
 def test_the_spread_is_the_weighted_variance_of_light_fields():
@@ -88,14 +88,13 @@ def test_the_spread_is_the_weighted_variance_of_light_fields():
     first, other = fields
     coarse = rng.random((2, 3)).astype(np.float32)
     models = [stored(field) for field in fields]
-    together = averaged(models, np.stack([coarse, 1 - coarse]), 2, models[1])
+    mean, spread, apart = averaged(models, np.stack([coarse, 1 - coarse]), 2, models[1])
     share = coarse.repeat(2, axis=0).repeat(2, axis=1)
     square = np.square(first - other).mean(axis=-1)
-    np.testing.assert_allclose(
-        together.light_field, share[..., None] * first + (1 - share[..., None]) * other, atol=1e-5
-    )
-    np.testing.assert_allclose(together.spread, share * (1 - share) * square, atol=2e-5)
-    np.testing.assert_allclose(together.apart, np.square(share) * square, atol=2e-5)
+    expected = share[..., None] * first + (1 - share[..., None]) * other
+    np.testing.assert_allclose(mean, expected, atol=1e-5)
+    np.testing.assert_allclose(spread, share * (1 - share) * square, atol=2e-5)
+    np.testing.assert_allclose(apart, np.square(share) * square, atol=2e-5)
 
 
 def test_the_excess_of_residuals_is_their_square_beyond_the_noise_and_never_0(held):

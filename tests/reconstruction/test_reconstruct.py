@@ -44,7 +44,7 @@ def reconstructed(folder, out, method, **given):
     return outcome
 
 
-@pytest.mark.parametrize(("method", "dictionary"), [("tv", None), ("dict-omp", "dct")])
+@pytest.mark.parametrize(("method", "dictionary"), [("tv", None), ("dict-admm", "lambertian")])
 def test_frames_become_a_light_field_with_a_page_and_metrics(frames, tmp_path, method, dictionary):
     metrics = reconstructed(frames, tmp_path, method, dictionary_spec=dictionary, truth=SCENE)
     light_field = load_hdf5(tmp_path / "light_field.h5")
@@ -101,13 +101,13 @@ def test_folders_that_hold_no_capture_are_refused(frames, tmp_path):
 
 def test_settings_come_from_yaml_and_a_misspelt_key_names_the_nearest(tmp_path):
     path = tmp_path / "settings.yaml"
-    path.write_text("tv: {mu: 0.01}\nsparse: {stride: 3, solver: {atoms: 7}}\n")
+    path.write_text("tv: {mu: 0.01}\nsparse: {stride: 3, solver: {max_steps: 7}}\n")
     settings = load_settings(path)
     assert settings.tv.mu == 0.01
     assert settings.sparse.stride == 3
-    assert settings.sparse.solver.atoms == 7
-    path.write_text("sparse: {solver: {atom: 7}}\n")
-    with pytest.raises(AppError, match="atoms"):
+    assert settings.sparse.solver.max_steps == 7
+    path.write_text("sparse: {solver: {max_step: 7}}\n")
+    with pytest.raises(AppError, match="max_steps"):
         load_settings(path)
     path.write_text("tv: {mu: -1}\n")
     with pytest.raises(AppError, match="mu"):
@@ -116,12 +116,12 @@ def test_settings_come_from_yaml_and_a_misspelt_key_names_the_nearest(tmp_path):
 
 def test_dictionaries_come_by_name_or_file(tmp_path):
     assert open_dictionary(None, (5, 5), 1).kind == "lambertian"
-    made = open_dictionary("dct", (5, 5), 1)
+    made = open_dictionary("lambertian", (5, 5), 1)
     assert made.patch_shape == (5, 5, 9, 9, 3)
     made.save(tmp_path / "own.h5")
     loaded = open_dictionary(str(tmp_path / "own.h5"), (5, 5), 1)
     np.testing.assert_array_equal(loaded.atoms, made.atoms)
-    assert open_dictionary("dct", (5, 5), 2).patch_shape[2:4] == (8, 8)
+    assert open_dictionary("lambertian", (5, 5), 2).patch_shape[2:4] == (8, 8)
     with pytest.raises(DictionaryError, match="no such file"):
         open_dictionary("nowhere.h5", (5, 5), 1)
 
@@ -131,7 +131,7 @@ def test_a_dictionary_for_other_views_is_refused(frames, tmp_path):
     Dictionary.normalised(atoms, "ksvd").save(tmp_path / "small.h5")
     with pytest.raises(DictionaryError, match="3x3 views"):
         reconstructed(
-            frames, tmp_path / "out", "dict-omp", dictionary_spec=str(tmp_path / "small.h5")
+            frames, tmp_path / "out", "dict-admm", dictionary_spec=str(tmp_path / "small.h5")
         )
 
 

@@ -39,17 +39,13 @@ def for_each_number_of_threads(call):
     return found
 """
 METHOD = """
-from emmc_rig.reconstruction.methods import MethodSettings
-
 camera = emmc.camera("scenario-ii-cfa", 2)
-slow = MethodSettings.model_validate({"sparse": {"solver": {"max_steps": 60}}})
-SLOW = "dict-ista", "dict-fista"
 
 def solved(method):
     size = (16, 16) if "dict" in method else (32, 40)
     psi = camera.psi(size)
     frames = camera.expose(emmc.scene("deep-occlusions", size=size), seed=0, psi=psi)
-    result = emmc.reconstruct(psi, frames, method, settings=slow if method in SLOW else None)
+    result = emmc.reconstruct(psi, frames, method)
     maps = [result.maps[name] for name in sorted(result.maps)]
     stated = without_times(result.metrics())
     return [*digests(result.light_field, *maps), repr(stated)]

@@ -10,7 +10,7 @@ from emmc_rig.model.errors import SensingError
 from emmc_rig.model.frames import even_frames
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.reconstruction.adaptive.settings import SIDES, AdaptiveSettings
-from emmc_rig.reconstruction.dictionary import dct_dictionary
+from emmc_rig.reconstruction.dictionary import lambertian_dictionary
 from emmc_rig.reconstruction.errors import ReconstructionError
 from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.methods import MethodSettings, reconstruct
@@ -104,7 +104,7 @@ def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step
     ("method", "binning"),
     [
         ("tv", 1),
-        ("dict-omp", 1),
+        ("dict-admm", 1),
         ("tv-dict", 2),
         ("adaptive-fast", 2),
         ("adaptive", 1),
@@ -112,7 +112,7 @@ def in_blocks(method, psi, frames, blocks, usable=None, dictionary=None, on_step
 )
 def test_every_method_works_in_blocks_and_loses_little(random_psi, method, binning, monkeypatch):
     psi, frames, truth = scene(random_psi, binning, size=(36, 100))
-    dictionary = dct_dictionary(VIEWS, (4, 4)) if "dict" in method else None
+    dictionary = lambertian_dictionary(VIEWS, (4, 4)) if "dict" in method else None
     # One shot takes no sparse patches in blocks: whether surfaces fail is not known beforehand.
     without = settings_of(method, adaptive=AdaptiveSettings(patches=None))
     whole = reconstruct(method, psi, even_frames(frames, 0.01), dictionary, without)

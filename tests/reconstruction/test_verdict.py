@@ -37,8 +37,14 @@ from emmc_rig.reconstruction.verdict.kept import (
 from emmc_rig.reconstruction.verdict.readings import blockiness, pixel_figures, quantised
 from emmc_rig.reconstruction.verdict.rules import CONSISTENT, LEVELS, verdict_from
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
-from emmc_rig.reconstruction.verdict.shadow import Relief, measured_relief, shadow, tile_edges
-from emmc_rig.reconstruction.verdict.shots import _differences, _differing, compared, motion
+from emmc_rig.reconstruction.verdict.shadow import (
+    Relief,
+    cross_strength,
+    measured_relief,
+    shadow,
+    tile_edges,
+)
+from emmc_rig.reconstruction.verdict.shots import _differences, _differing, brightness, motion
 from emmc_rig.study.stability.faults import Point
 from emmc_rig.study.trial import Capture, trial_of
 
@@ -250,12 +256,10 @@ def test_jpeg_is_seen_by_its_blocks_and_coarse_steps_by_their_repetition(one_sho
 
 def test_shots_tell_their_brightness_and_whose_masks_they_show(three):
     gains = np.array([1.1, 0.9, 1.0])
-    found = compared(relief_in(three, grey(three) * gains[:, None, None]))
-    np.testing.assert_allclose(found.brightness, gains, atol=0.01)
-    swapped = compared(relief_in(three, grey(three)[[0, 2, 1]]))
-    assert swapped.masks[1].argmax() == 2
-    assert swapped.masks[2].argmax() == 1
-    assert swapped.masks[0].argmax() == 0
+    found = brightness(relief_in(three, grey(three) * gains[:, None, None]))
+    np.testing.assert_allclose(found, gains, atol=0.01)
+    swapped = cross_strength(relief_in(three, grey(three)[[0, 2, 1]]))
+    assert swapped.argmax(axis=1).tolist() == [0, 2, 1]
 
 
 def test_holes_are_measured_and_placed(three):
@@ -688,10 +692,11 @@ def test_what_changes_in_one_shot_is_named_with_shot_and_place(three, shot, side
 def test_noise_differs_between_shots_by_as_much_as_is_expected_of_it(three):
     rng = np.random.default_rng(1)
     residual = rng.standard_normal(three.frames_shape).astype(np.float32)
-    found = _differences(relief_in(three, grey(three)), residual, np.arange(3), 1)
+    shots = np.arange(3)
+    apart, expected, least = _differences(relief_in(three, grey(three)), residual, shots, 1)
     # From the mean of three each differs by two thirds of its square; spots take some of the rest.
-    assert 2 / 3 < found.apart.mean() / found.expected.mean() < 1.25 * 2 / 3
-    assert found.least == pytest.approx(found.expected.mean())
+    assert 2 / 3 < apart.mean() / expected.mean() < 1.25 * 2 / 3
+    assert least == pytest.approx(expected.mean())
 
 
 def with_moved_object(psi, shot, by_px=6):

@@ -336,7 +336,7 @@ def test_a_row_of_views_is_a_light_field(views):
         ("tv", (1, 28), BANDS, 1, True),
         ("tv-dict", (3, 3), ANGLES, 2, False),
         ("tv-dict", (8, 1), TIMES, 1, False),
-        ("dict-omp", (1, 24), BANDS, 1, False),
+        ("dict-admm", (1, 24), BANDS, 1, False),
         ("adaptive-fast", (3, 3), ANGLES, 3, True),
         ("adaptive-fast", (9, 9), ANGLES, 1, False),
         ("adaptive-fast", (1, 28), BANDS, 1, True),

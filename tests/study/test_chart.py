@@ -50,7 +50,7 @@ def test_a_chart_is_answered_in_words():
 
 
 def test_pooled_are_the_configurations_of_every_scene():
-    tv, omp = Configuration("tv"), Configuration("dict-omp")
+    tv, omp = Configuration("tv"), Configuration("dict-admm")
     results = {
         Point(Capture("dark", "cam"), tv): figures(1.0, 20.0),
         Point(Capture("far", "cam"), tv): figures(4.0, 30.0),

@@ -135,21 +135,21 @@ def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
         {
             ("a", "mask-shift", "tv"): (30, 29, 10),
             ("a", "flicker", "tv"): (30, 29, 29),
-            ("a", "mask-shift", "dict-omp"): (30, 20, 10),
-            ("a", "flicker", "dict-omp"): (30, 20, 10),
+            ("a", "mask-shift", "dict-admm"): (30, 20, 10),
+            ("a", "flicker", "dict-admm"): (30, 20, 10),
         }
     )
     head = _head(curves(results))
     assert head.level == "tv holds out best"
     assert "under 1 of 2 faults" in head.why
-    assert any("for comparison, dict-omp: under 2 of 2" in line for line in head.next)
-    # tv falls from 29 dB to 10 dB between 1 and 4 px, and never by flicker; dict-omp at 0.3.
+    assert any("for comparison, dict-admm: under 2 of 2" in line for line in head.next)
+    # tv falls from 29 dB to 10 dB between 1 and 4 px, and never by flicker; dict-admm at 0.3.
     shift, flicker = answers(curves(results))
     assert shift == (
-        "Mask shift: dict-omp has lost 3 dB at 0.3 px; tv has lost 3 dB at 1.2 px, the last."
+        "Mask shift: dict-admm has lost 3 dB at 0.3 px; tv has lost 3 dB at 1.2 px, the last."
     )
     assert flicker == (
-        "Lamp flicker between shots: dict-omp has lost 3 dB at 0.3 %; tv nowhere in this sweep."
+        "Lamp flicker between shots: dict-admm has lost 3 dB at 0.3 %; tv nowhere in this sweep."
     )
 
 
@@ -194,10 +194,10 @@ def test_the_clean_trial_is_measured_once_for_all_faults(few_steps, undrawn, tmp
 
 
 def test_a_method_that_is_not_installed_is_one_line(few_steps, undrawn, monkeypatch, tmp_path):
-    missing = replace(METHODS["dict-omp"], package="no_such_module")
-    monkeypatch.setitem(METHODS, "dict-omp", missing)
-    outcome = swept(tmp_path / "out", methods=("tv", "dict-omp"))
-    assert outcome.excluded() == ["dict-omp needs no_such_module: not installed"]
+    missing = replace(METHODS["dict-admm"], package="no_such_module")
+    monkeypatch.setitem(METHODS, "dict-admm", missing)
+    outcome = swept(tmp_path / "out", methods=("tv", "dict-admm"))
+    assert outcome.excluded() == ["dict-admm needs no_such_module: not installed"]
     assert {curve.method for curve in outcome.curves} == {"tv"}
     assert {point.method for point in planned(quick(methods=("all",)))} == set(METHODS)
 

@@ -38,12 +38,6 @@ VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
         DEFAULT: {},
         "best": {"tv": {"rtol": 1e-5, "max_steps": 1500}},
     },
-    "dict-omp": {
-        "5 atoms, stride 9": {"sparse": {"stride": 9, "solver": {"atoms": 5}}},
-        DEFAULT: {},
-        "40 atoms": {"sparse": {"solver": {"atoms": 40}}},
-        "stride 3": {"sparse": {"stride": 3}},
-    },
     "dict-admm": {
         "fast": {"sparse": _QUICK_PATCHES},
         DEFAULT: {},
@@ -55,8 +49,7 @@ VARIATIONS: dict[str, dict[str, dict[str, Any]]] = {
         "best": {"sparse": {"stride": 3}, "tv": {"rtol": 1e-4, "max_steps": 1500}},
     },
 }
-SLOW_METHODS = ("dict-lars", "dict-ista", "dict-fista", "dict-sl0")
-BESIDE_FRONT = ("best", "fast", "5 atoms, stride 9", "40 atoms", "stride 3")
+BESIDE_FRONT = ("best", "fast")
 """Levels that take long, or that the front over all scenes does without: --fast has none."""
 
 WARM_UP_PX = 27
@@ -138,9 +131,7 @@ def configurations(settings: ChartSettings) -> list[Configuration]:
     """
     for name in settings.methods:
         find_method(name)
-    chosen = settings.methods or [
-        method for method in installed_methods() if not (settings.fast and method in SLOW_METHODS)
-    ]
+    chosen = settings.methods or installed_methods()
     return [
         Configuration(method, level, MethodSettings.model_validate(changed))
         for method in METHODS

@@ -39,7 +39,7 @@ from emmc_rig.study.stability.faults import FAULTS, Point, find_fault
 from emmc_rig.study.trial import Capture, Trial, method_inputs
 
 POINTS_CSV, BREAKS_CSV, DRAWN = "points.csv", "breaking.csv", "charts"
-SWEPT_METHODS = ("tv", "dict-omp", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
+SWEPT_METHODS = ("tv", "dict-admm", "tv-dict", "adaptive", "adaptive-fast")
 FAST_METHODS = ("tv", "adaptive-fast")
 SCENES = ("deep-occlusions", "near-planar", "non-lambertian")
 FAST_SCENES = ("deep-occlusions",)

@@ -43,22 +43,17 @@ CSV = "tables.csv"
 Size = tuple[int, int] | None
 VIEWS = (5, 5)
 _ENDINGS = (".h5", ".hdf5")
-UNTRAINED = ("dct", "lambertian")
-"""Kinds of dictionaries that are made by formula."""
 
 
 class TablesSettings(Settings):
     """How everything is computed; sizes are middles of each scene.
 
-    The solver of `methods.sparse`, ADMM as in the paper, codes the patches of `dict-admm` once;
-    `tv-dict` starts from the same patches. dictionary: see `open_dictionary`.
+    Patches are coded once, for `dict-admm` and for `tv-dict`. dictionary: see `open_dictionary`.
     """
 
     size: Size = None
     binned_size: Size = None
-    methods: MethodSettings = MethodSettings(
-        sparse=SparseSettings(solver=BPDNSettings(method="admm"))
-    )
+    methods: MethodSettings = MethodSettings()
     binned_stride: int = Field(default=4, ge=2, multiple_of=2)
     dictionary: str | None = None
     seed: int = Field(default=0, ge=0)
@@ -76,7 +71,7 @@ FAST = TablesSettings(
     binned_size=(32, 32),
     methods=MethodSettings(
         tv=TVSettings(max_steps=100),
-        sparse=SparseSettings(solver=BPDNSettings(method="admm", rtol=1e-2, max_steps=200)),
+        sparse=SparseSettings(solver=BPDNSettings(rtol=1e-2, max_steps=200)),
     ),
 )
 """Crops: all tables on thirteen scenes in three minutes on two cores."""
@@ -152,7 +147,7 @@ def check_dictionary(
 
 def _trained_on(dictionary: Dictionary) -> list[str] | None:
     """Return the names of the scenes that a dictionary learned from; None when it does not say."""
-    if dictionary.kind in UNTRAINED:
+    if dictionary.kind == "lambertian":  # made by formula
         return []
     try:
         scenes = parse_json(dictionary.provenance, "provenance", ValueError)["scenes"]
