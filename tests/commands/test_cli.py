@@ -134,7 +134,9 @@ def test_wrong_usage_of_every_command_is_a_line_and_code_2(run):
         assert (code, "no such command 'nosuch'" in err) == (2, True), err
         _wrong(words, err)
     for words, command in every.items():
-        for option in [known for known in command.params if not getattr(known, "is_flag", True)][:1]:
+        for option in [known for known in command.params if not getattr(known, "is_flag", True)][
+            :1
+        ]:
             code, _, err = run(*words, option.opts[-1])
             assert (code, "requires an argument" in err) == (2, True), err
             _wrong(words, err)
