@@ -110,7 +110,10 @@ def test_what_the_bench_reads_of_a_scene_are_frames_by_the_report(bench, calibra
     report.save(tmp_path / "psi")
     np.testing.assert_array_equal(emmc.Psi.load(tmp_path / "psi/psi.h5").weights, psi.weights)
     page = (tmp_path / "psi/report.html").read_text()
-    assert "reconstruct(calibration.psi, calibration.frames(dn))" in page or report.outcome.advice
+    assert (
+        "emmc_rig.reconstruct(calibration.psi, calibration.frames(dn))" in page
+        or report.outcome.advice
+    )
 
 
 BOARD = np.full((2, *SIZE), 30_000.0)
@@ -157,7 +160,7 @@ MISTAKES = {
 
 
 def test_what_arrays_and_sessions_do_not_take_is_refused():
-    with pytest.raises(TypeError, match="whiteboards: got .*a session is given without poses"):
+    with pytest.raises(TypeError, match=r"whiteboards: got .*a session is given without poses"):
         emmc.calibrate("plan-session", "free")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="sensor: got True; it takes True with a session only"):
         emmc.calibrate([BOARD], [{}], CAMERA, darks=DARK, sensor=True)
