@@ -104,7 +104,7 @@ def calibrate(
         AppError: an unknown method; whiteboards without poses, of another size, or fewer than are
             needed; masks that moved by so little that millimetres were given.
         CalibrationError: whiteboards that are unfit: no lamp, another mask, saturated, unsteady.
-        ArgumentError: an argument of another type, or one that a session or arrays do not take.
+        ArgumentError: an argument of another type; poses with a session, or `sensor` with arrays.
     """
     arrays = isinstance(whiteboards, ARRAYS)
     if not arrays and all(given is None for given in (poses, camera, darks)):

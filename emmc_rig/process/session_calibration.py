@@ -158,9 +158,12 @@ class SessionCalibration:
 
 
 def calibrate_session(
-    session: Session | str | Path, method: str, sensor: bool, watcher: Watcher | None
+    session: object, method: str, sensor: bool, watcher: Watcher | None
 ) -> SessionCalibration:
-    """Return Psi as a session's whiteboards measure it, see `calibrating.calibrate`."""
+    """Return Psi as a session's whiteboards measure it, see `calibrating.calibrate`.
+
+    Raises ArgumentError unless `session` is a session or its folder.
+    """
     if not isinstance(session, Session):
         takes = "a session, or its folder; or whiteboards as arrays, with poses and a camera"
         session = Session(path_of(session, "session", takes))

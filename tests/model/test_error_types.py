@@ -1,4 +1,4 @@
-"""Each public error is also of the built-in type that fits, so that callers may catch that."""
+"""Public errors derive from built-in types, so that callers may catch OSError or ValueError."""
 
 import pickle
 
