@@ -93,7 +93,7 @@ def test_arrays_make_the_same_psi_as_the_board_sets_that_a_session_makes(taken, 
     layout = psi_layout(CAMERA, SIZE)
     few = every.with_frames(fitted)
     outcome = calibrate(CAMERA, layout, ("parametric", "mixed"), held_out, few)
-    np.testing.assert_array_equal(calibrated[0].weights, outcome.calibration.psi.weights)
+    np.testing.assert_array_equal(calibrated.psi.weights, outcome.calibration.psi.weights)
 
 
 @pytest.mark.slow
