@@ -203,7 +203,7 @@ def calibrate_simulated(
     sensor = "response" not in settings.skip
     with simulated_session(plan, camera, rig, watcher) as session:
         captured_s = time.perf_counter() - started
-        found = calibrate(session, route, sensor=sensor, watcher=watcher)
+        found = calibrate(session, method=route, sensor=sensor, watcher=watcher)
         held_out = sum(frame.kind == "held-out" for frame in session.frames)
     watcher.begin("the true Psi, for comparison", None)
     true = true_psi(camera, rig, bench)

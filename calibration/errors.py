@@ -3,5 +3,5 @@
 from emmc_rig.model.errors import AdvisedError
 
 
-class CalibrationError(AdvisedError):
+class CalibrationError(AdvisedError, ValueError):
     """Root of the calibration's errors; shown to the user as one line."""

@@ -34,7 +34,7 @@ CAMERAS = {
     "u3v": CameraProtocol("emmc_rig.drivers.u3v", "SERIAL", (0xEF, 0x05, 0x00), b"U3VL"),
     "gphoto2": CameraProtocol("emmc_rig.drivers.gphoto", "PORT"),
     "mm": CameraProtocol("emmc_rig.drivers.micromanager", "CONFIG.cfg"),
-    "folder": CameraProtocol("emmc_rig.drivers.folder", "DIR"),
+    "folder": CameraProtocol("emmc_rig.drivers.folder", "PATH"),
 }
 CAMERA_HELP = ", ".join(f"{name}:{camera.address}" for name, camera in CAMERAS.items())
 """What `--camera` takes, for help texts and refusals."""

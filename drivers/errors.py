@@ -14,8 +14,10 @@ def _shown(raw: bytes) -> str:
     return f"{raw[:SHOWN_BYTES]!r}... ({len(raw)} bytes)"
 
 
-class DriverError(Exception):
+class DriverError(OSError):
     """Root of the drivers' errors; shown to the user as one line.
+
+    An error of a value that the caller chose is a ValueError, too; one of time a TimeoutError.
 
     `axis`, `command` and `reply` are what the error is about, `stage` how the stage was named when
     it was opened; "" where unknown.
@@ -62,7 +64,7 @@ class PortError(DriverError):
         super().__init__(f"serial port {port} {what}", advice)
 
 
-class PortNotFoundError(PortError):
+class PortNotFoundError(PortError, FileNotFoundError):
     """The name matches no serial port, or several."""
 
     def __init__(self, port: str, what: str = "does not exist") -> None:
@@ -79,7 +81,7 @@ class PortBusyError(PortError):
         self.holder = holder
 
 
-class PortPermissionError(PortError):
+class PortPermissionError(PortError, PermissionError):
     """The serial port exists, but this user may not open it; `rule` is the udev rule that helps."""
 
     def __init__(self, port: str, rule: str) -> None:
@@ -92,7 +94,7 @@ class PortPermissionError(PortError):
         self.rule = rule
 
 
-class PortGoneError(PortError):
+class PortGoneError(PortError, ConnectionError):
     """The port went away while it was open."""
 
     loses_position = True
@@ -101,7 +103,7 @@ class PortGoneError(PortError):
         super().__init__(port, "went away", "plug it in, reconnect, then home the axes")
 
 
-class TransportTimeoutError(DriverError):
+class TransportTimeoutError(DriverError, TimeoutError):
     """No complete answer arrived in time; `partial` is what did arrive."""
 
     def __init__(self, port: str, timeout_s: float, partial: bytes = b"") -> None:
@@ -150,7 +152,7 @@ class CommandRefusedError(DriverError):
         )
 
 
-class UnknownAxisError(DriverError):
+class UnknownAxisError(DriverError, ValueError):
     """The stage has no axis of that name."""
 
     def __init__(self, axis: str, known: tuple[str, ...]) -> None:
@@ -159,7 +161,7 @@ class UnknownAxisError(DriverError):
         )
 
 
-class LimitExceededError(DriverError):
+class LimitExceededError(DriverError, ValueError):
     """A target outside the limits; nothing was sent to the device."""
 
     def __init__(self, axis: str, target_um: float, limits_um: tuple[float, float]) -> None:
@@ -172,7 +174,7 @@ class LimitExceededError(DriverError):
         self.limits_um = limits_um
 
 
-class SpeedLimitError(DriverError):
+class SpeedLimitError(DriverError, ValueError):
     """A speed that the axis cannot have; nothing was sent to the device."""
 
     def __init__(self, axis: str, speed_um_s: float, top_speed_um_s: float) -> None:
@@ -183,7 +185,7 @@ class SpeedLimitError(DriverError):
         )
 
 
-class SpeedFixedError(DriverError):
+class SpeedFixedError(DriverError, ValueError):
     """The axis has one speed, which cannot be chosen; nothing was sent to the device."""
 
     def __init__(self, axis: str, advice: str) -> None:
@@ -266,7 +268,7 @@ class LostPositionError(AxisFaultError):
     usual_advice = "home the axis, and repeat what was done since it was last homed"
 
 
-class MoveTimeoutError(DriverError):
+class MoveTimeoutError(DriverError, TimeoutError):
     """An axis was still moving when it should long have arrived."""
 
     def __init__(self, axis: str, time_limit_s: float) -> None:
@@ -308,7 +310,9 @@ class _WordedError(DriverError):
         self.reason = reason
 
 
-class RawFrameError(_WordedError, says="unusable RAW frame, {}", advice="capture it again"):
+class RawFrameError(
+    _WordedError, ValueError, says="unusable RAW frame, {}", advice="capture it again"
+):
     """Camera bytes that are not the RAW frame they should be."""
 
 
@@ -322,6 +326,7 @@ class UsbUnavailableError(
 
 class UsbPermissionError(
     _WordedError,
+    PermissionError,
     says="no permission to open {}",
     advice="install drivers/99-emmc-rig.rules in /etc/udev/rules.d, run `udevadm control --reload` "
     "and plug the device in again",
@@ -331,6 +336,7 @@ class UsbPermissionError(
 
 class UsbGoneError(
     _WordedError,
+    ConnectionError,
     says="{} went away",
     advice="plug it in, switch it on, then open the device again",
 ):
@@ -347,7 +353,7 @@ class CaptureError(_WordedError, says="no frame, {}", advice="capture it again")
     """The camera was released but gave no usable frame; the next may be taken."""
 
 
-class NoFrameError(CaptureError, advice="check the trigger and the cable"):
+class NoFrameError(CaptureError, TimeoutError, advice="check the trigger and the cable"):
     """No frame began within its time."""
 
 
@@ -376,7 +382,7 @@ class GenicamMissingError(DriverError):
         super().__init__("USB3 Vision cameras need genicam", 'pip install "emmc-rig[u3v]"')
 
 
-class UsbNotFoundError(DriverError):
+class UsbNotFoundError(DriverError, FileNotFoundError):
     """No device that matches is plugged in; `present` names those that are."""
 
     def __init__(self, wanted: str, present: tuple[str, ...] = ()) -> None:
@@ -405,7 +411,7 @@ class UsbStalledError(DriverError):
         )
 
 
-class UsbTimeoutError(DriverError):
+class UsbTimeoutError(DriverError, TimeoutError):
     """A transfer did not finish in time; `done` is how many bytes of it passed."""
 
     def __init__(self, device: str, timeout_s: float, done: int = 0) -> None:
@@ -424,7 +430,7 @@ class UsbTransferError(DriverError):
         self.reason = reason
 
 
-class CameraSettingError(DriverError):
+class CameraSettingError(DriverError, ValueError):
     """The camera cannot be set to that; nothing was sent to it."""
 
     def __init__(self, setting: str, reason: str) -> None:
@@ -451,7 +457,7 @@ class CameraRefusedError(DriverError):
         super().__init__(f"the camera refused {operation} with {answer}: {advice}")
 
 
-class CameraBusyError(DriverError):
+class CameraBusyError(DriverError, TimeoutError):
     """The camera answered "busy", or asked for more time, for too long."""
 
     def __init__(self, operation: str, waited_s: float) -> None:

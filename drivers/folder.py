@@ -157,10 +157,10 @@ class FolderCamera:
         path = self._left[-1]
         try:
             return decode_raw(path.read_bytes(), shape)
-        except OSError as fault:
-            raise FolderCameraError(str(path), f"it cannot be read ({fault.strerror})") from fault
         except RawFrameError as fault:
             raise RawFrameError(f"{path.name}: {fault.reason}") from fault
+        except OSError as fault:
+            raise FolderCameraError(str(path), f"it cannot be read ({fault.strerror})") from fault
 
 
 def _recorded(path: Path) -> Recorded:

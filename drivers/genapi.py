@@ -15,7 +15,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-from emmc_rig.drivers.errors import CameraDescriptionError, CameraSettingError, GenicamMissingError
+from emmc_rig.drivers.errors import (
+    CameraDescriptionError,
+    CameraSettingError,
+    DriverError,
+    GenicamMissingError,
+)
 
 XML_LIMIT = 32 << 20
 Number = int | float
@@ -170,6 +175,8 @@ class Features:
                 for port in self._ports:
                     port.invalidate_node()  # and with it every value read through it before
                 yield node
+            except DriverError:
+                raise
             except (self._genapi.GenericException, ArithmeticError, ValueError) as error:
                 raise CameraDescriptionError(
                     f"{name} cannot be worked out ({_shown(error)})"

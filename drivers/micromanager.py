@@ -128,6 +128,8 @@ class LoadedCore:
                 # Not every file begins by unloading what an earlier one left.
                 self.core.unloadAllDevices()
                 self.core.loadSystemConfiguration(self.port)
+        except MicroManagerError:
+            raise
         except OSError as error:
             raise MicroManagerError(
                 f"{self.port} cannot be loaded ({_one_line(error)})",

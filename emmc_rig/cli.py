@@ -6,7 +6,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any, NoReturn, cast
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -23,7 +23,7 @@ from emmc_rig.commands.figure import figure
 from emmc_rig.commands.import_ import import_
 from emmc_rig.commands.live import live
 from emmc_rig.commands.mask import mask
-from emmc_rig.commands.modes import ModalCommand
+from emmc_rig.commands.modes import ModalCommand, UsageError
 from emmc_rig.commands.output import in_shell, say
 from emmc_rig.commands.reconstruct import reconstruct
 from emmc_rig.commands.session import app as session
@@ -35,8 +35,6 @@ from emmc_rig.model.errors import RemovedSettingWarning, ViewOrderWarning
 from emmc_rig.version import __version__
 
 INTERRUPTED = 130
-UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])
-"""Of click, which typer brings under a name of its own; it exports this subclass alone."""
 
 app = typer.Typer(
     name="emmc-rig",
@@ -50,6 +48,14 @@ GROUPS: dict[str, tuple[typer.Typer | Callable[..., None], ...]] = {
     "Studies": (chart, stability, tables, design),
 }
 """Commands by the panel of the help that lists them."""
+
+
+def help_of_group(context: typer.Context) -> None:
+    """Show the help of a group that is called without a command."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
 for panel, commands in GROUPS.items():
     for command in commands:
         if isinstance(command, typer.Typer):
@@ -57,6 +63,7 @@ for panel, commands in GROUPS.items():
                 name = member.name or getattr(member.callback, "__name__", "")
                 member.cls = ModalCommand
                 member.epilog = examples_of(f"{command.info.name} {name.replace('_', '-')}")
+            command.callback(invoke_without_command=True, help=command.info.help)(help_of_group)
             app.add_typer(command, rich_help_panel=panel)
         else:
             name = command.__name__.rstrip("_")  # `import` is a word of Python's
@@ -76,7 +83,7 @@ def root(
         raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo("start: emmc-rig demo")
-        typer.echo(context.get_help())
+    help_of_group(context)
 
 
 def main() -> None:
@@ -98,8 +105,17 @@ def main() -> None:
     except MemoryError:
         _fail("not enough memory: use a smaller --size or fewer shots", 1)
     except UsageError as fault:
-        fault.show()
-        sys.exit(fault.exit_code)
+        _fail(_usage_line(fault), 2)
+
+
+def _usage_line(fault: typer.BadParameter) -> str:
+    """Return wrong usage as one line; typer's own messages get the command that helps."""
+    said = fault.format_message().removeprefix("Invalid value: ").removesuffix(".")
+    if isinstance(fault, typer.BadParameter) and fault.param is None:
+        return said
+    command = fault.ctx.command_path if fault.ctx else "emmc-rig"
+    said = said.removeprefix("Invalid value for ").replace("Input should", "should")
+    return f"{said[0].lower()}{said[1:]}; `{command} -h` shows what it takes"
 
 
 def _typed() -> list[str]:

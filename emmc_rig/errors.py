@@ -12,7 +12,7 @@ class AppError(AdvisedError):
     """Root of the application's errors; shown to the user as one line."""
 
 
-class WrongUsageError(AppError):
+class WrongUsageError(AppError, ValueError):
     """An option's value that cannot be read: the command was typed wrongly."""
 
 

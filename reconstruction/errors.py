@@ -3,7 +3,7 @@
 from emmc_rig.model.errors import AdvisedError
 
 
-class ReconstructionError(AdvisedError):
+class ReconstructionError(AdvisedError, ValueError):
     """Root of the reconstruction's errors; shown to the user as one line."""
 
 

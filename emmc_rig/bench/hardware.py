@@ -551,6 +551,8 @@ def _stage(config: SerialConfig, transport: Callable[[str], Transport], clock: C
             wire = transport(axis.port)
             channels[name] = AptAxis(wire, actuator, axis.destination, axis.channel)
         return AptStage(channels, clock, settings)
+    except DriverError:
+        raise
     except ValueError as error:
         raise AppError(f"stage {config.protocol}: {error}") from error
 

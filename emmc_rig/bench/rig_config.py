@@ -115,7 +115,7 @@ class RealRig(AnyRig):
     zero_um: place of each axis that centres the mask or the pinhole of the aperture plate; of an
     axis that a hand moves, the reading of its micrometer. window_um: aperture_x of the plate's open
     window, from there; window_side_um: side of the window, for plans that open parts of the
-    aperture. A recording (camera `folder:DIR`, stage `simulated`) needs neither. by_hand: a person
+    aperture. A recording (camera `folder:PATH`, stage `simulated`) needs neither. by_hand: a person
     is asked for everything that no axis moves: board, masks, pinhole, and the lamp of a rig without
     lights; if false nothing of these changes, as in the replay of a recording.
     """

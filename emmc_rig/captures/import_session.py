@@ -26,7 +26,7 @@ from emmc_rig.captures.plan import Checks, Plan, planned_camera
 from emmc_rig.drivers.camera import EXPOSURE_AGREEMENT
 from emmc_rig.drivers.capture_order import capture_order
 from emmc_rig.drivers.raw import RawFrame, captured_at
-from emmc_rig.errors import AppError
+from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.own_arrays import OwnFrames, read_own
 from emmc_rig.model.camera import Camera, build_imaging_matrix, pixel_light
@@ -142,6 +142,8 @@ def import_session(
             found = list(_items(listed, known, planes, Path(spool), on_file, notes))
             items = _in_capture_order(found, notes)
             return _Import(items, known, camera, notes).write(out)
+    except ERRORS:
+        raise
     except OSError as fault:
         why = fault.strerror or fault
         raise AppError(f"{fault.filename or out}: {why}; nothing was imported") from fault

@@ -32,7 +32,7 @@ from emmc_rig.captures.schedule import Estimate, ordered, pace_of
 from emmc_rig.captures.sequencer import Sequencer
 from emmc_rig.captures.until import Until, refuse_unless_shots_can_be_spared
 from emmc_rig.drivers.folder import FolderCamera, Recorded
-from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.model.arguments import NAMES, path_of, required
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.errors import CameraError
@@ -235,6 +235,8 @@ def disk_faults_named(session: Session) -> Iterator[None]:
     """Turn what the disk raises into one line."""
     try:
         yield
+    except ERRORS:
+        raise
     except OSError as fault:
         why = {
             errno.ENOSPC: "the disk is full; make room",

@@ -13,6 +13,7 @@ import typer
 
 from emmc_rig.commands.output import give_result, show_table, shown_progress, tell
 from emmc_rig.drivers.cameras import CAMERA_HELP
+from emmc_rig.drivers.errors import DriverError
 from emmc_rig.errors import AppError
 from emmc_rig.progress import Watcher
 from emmc_rig.store.folders import new_file, refuse_inside_session
@@ -123,6 +124,8 @@ def choose(device: Camera, exposure_s: float | None, gain: float | None) -> None
             device.set_exposure_s(exposure_s)
         if gain is not None:
             device.set_gain(gain)
+    except DriverError:
+        raise
     except ValueError as fault:
         raise AppError(str(fault)) from fault
 

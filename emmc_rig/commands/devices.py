@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="devices",
-    no_args_is_help=True,
     help="List, test and move stages, cameras and lights.",
 )
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 from typer.core import TyperCommand
@@ -38,6 +38,9 @@ NEEDS: dict[str, dict[str, str | tuple[str, ...]]] = {
 RENAMED = {"calibrate": {"--route": "--method", "--leave-out": "--skip"}}
 """By command: options of earlier versions, which scripts use, and their new names."""
 _NEGATIVE = re.compile(r"-\.?\d")
+_PATH = re.compile(r"<(list\[)?path\]?>", re.IGNORECASE)
+UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__bases__[0])
+"""Of click, which typer brings under a name of its own; it exports this subclass alone."""
 SIMULATED_ONLY = ("scene", "size", "seed", "rays", "flaws", "real_time")
 
 
@@ -46,6 +49,8 @@ class ModalCommand(TyperCommand):
 
     def __init__(self, *args: Any, params: list | None = None, **more: Any) -> None:
         super().__init__(*args, params=[*(params or ()), _json_option()], **more)
+        for parameter in self.params:
+            _name_path(parameter)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line; options of earlier versions are taken under their new names.
@@ -56,7 +61,11 @@ class ModalCommand(TyperCommand):
         words = [_under_new_name(word, renamed) for word in args]
         # A number with a space before it looks like no option; text is taken without the space.
         words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
-        left = super().parse_args(ctx, words)
+        try:
+            left = super().parse_args(ctx, words)
+        except UsageError as fault:  # the parser's have no context: they name no command
+            fault.ctx = fault.ctx or ctx
+            raise
         for name, value in ctx.params.items():
             if isinstance(value, str) and _NEGATIVE.match(value.lstrip()):
                 ctx.params[name] = value.lstrip()
@@ -92,6 +101,12 @@ def _under_new_name(word: str, renamed: Mapping[str, str]) -> str:
     """Return a word of the command line, `--old` or `--old=value` under its new name."""
     option, equals, value = word.partition("=")
     return renamed.get(option, option) + equals + value
+
+
+def _name_path(parameter: Any) -> None:
+    """Let the help call a parameter's type PATH where it is one, as other programs do."""
+    shown = parameter.display_type
+    parameter.display_type = lambda context: _PATH.sub("PATH", shown(context))
 
 
 def _json_option() -> Any:

@@ -11,6 +11,7 @@ DEFAULT_SCENE = "deep-occlusions"
 DEFAULT_CAMERA = "rgbw-bayer-3shots"
 SIZE_VARIABLE = "EMMC_SIZE"
 """Environment variable: the --size where none is given, so that everything can be tried small."""
+NAME_OR_PATH = "NAME|PATH"
 SIMULATED_PANEL, PARALLEL_PANEL = "Simulated rig", "Large light fields"
 """Panels of the help for options that few commands' users need."""
 
@@ -18,11 +19,17 @@ SceneOption = Annotated[
     str,
     typer.Option(
         "--scene",
+        metavar=NAME_OR_PATH,
         help="a folder of view_ROW_COL.png, an HDF5 file, or a built-in scene's name",
     ),
 ]
 CameraOption = Annotated[
-    str, typer.Option("--camera", help="a name that `emmc-rig cameras` lists, or a YAML file")
+    str,
+    typer.Option(
+        "--camera",
+        metavar=NAME_OR_PATH,
+        help="a name that `emmc-rig cameras` lists, or a YAML file",
+    ),
 ]
 ShotsOption = Annotated[
     int | None, typer.Option("--shots", min=1, help="number of shots (default: the camera's own)")
@@ -49,7 +56,10 @@ def out_option(default: str) -> Any:
 
 
 TruthOption = Annotated[
-    str | None, typer.Option("--truth", help="the scene that was captured, to compare with")
+    str | None,
+    typer.Option(
+        "--truth", metavar=NAME_OR_PATH, help="the scene that was captured, to compare with"
+    ),
 ]
 MethodOption = Annotated[
     str | None, typer.Option("--method", help="see `reconstruct --list` (default: adaptive)")
@@ -80,12 +90,18 @@ ClusterOption = Annotated[
 ]
 DictionaryOption = Annotated[
     str | None,
-    typer.Option("--dictionary", help="of methods that need one: lambertian, or a file"),
+    typer.Option(
+        "--dictionary",
+        metavar=NAME_OR_PATH,
+        help="of methods that need one: lambertian, or a file",
+    ),
 ]
 ScenesOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--scene", help="a folder of views, an HDF5 file or a built-in scene's name; may repeat"
+        "--scene",
+        metavar=NAME_OR_PATH,
+        help="a folder of views, an HDF5 file or a built-in scene's name; may repeat",
     ),
 ]
 MethodsOption = Annotated[
@@ -102,12 +118,16 @@ StageOption = Annotated[
     ),
 ]
 RigOption = Annotated[
-    str | None, typer.Option("--rig", help="simulated, or a YAML file of real devices")
+    str | None,
+    typer.Option("--rig", metavar=NAME_OR_PATH, help="simulated, or a YAML file of real devices"),
 ]
 RigSceneOption = Annotated[
     str,
     typer.Option(
-        "--scene", help="what its camera looks at, as in `demo`", rich_help_panel=SIMULATED_PANEL
+        "--scene",
+        metavar=NAME_OR_PATH,
+        help="what its camera looks at, as in `demo`",
+        rich_help_panel=SIMULATED_PANEL,
     ),
 ]
 RigSizeOption = Annotated[

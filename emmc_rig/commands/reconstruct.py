@@ -81,6 +81,9 @@ def reconstruct(
     out: Annotated[Path | None, out_option("in a session, else emmc-reconstruction")] = None,
 ) -> None:
     """Reconstruct light fields from frames, or a film of them, with a verdict."""
+    if list_methods:
+        _list_methods()
+        return
     if frames is not None and len(frames) == 1:
         refuse_missing(frames[0], WRITTEN_BY)  # before the methods load, for a second
     from emmc_rig.process.captures import opened_capture
@@ -88,9 +91,6 @@ def reconstruct(
     from emmc_rig.process.reconstructing import load_settings, reconstruct_captures
     from emmc_rig.reconstruction.methods import DEFAULT_METHOD, find_method
 
-    if list_methods:
-        _list_methods()
-        return
     if not frames:
         raise typer.BadParameter(
             "name a session or a folder of frames, or list the methods by --list"

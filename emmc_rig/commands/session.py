@@ -14,7 +14,6 @@ from emmc_rig.commands.output import give_result, show_table, shown_progress, te
 
 app = typer.Typer(
     name="session",
-    no_args_is_help=True,
     help="List, show, verify and export sessions of `capture`.",
 )
 
@@ -120,7 +119,7 @@ def verify(session: Folder) -> None:
 @app.command()
 def export(
     session: Folder,
-    out: Annotated[Path, typer.Option("--out", help="file to write, FILE.h5; with --dng a folder")],
+    out: Annotated[Path, typer.Option("--out", help="file to write, as s.h5; with --dng a folder")],
     compress: Annotated[
         bool, typer.Option("--compress", help="compress by gzip: much slower")
     ] = False,

@@ -96,10 +96,7 @@ class Sensor(Settings):
 
     @model_validator(mode="after")
     def _known_tile(self) -> Sensor:
-        try:
-            cfa_tile(self.cfa)
-        except CameraError as fault:
-            raise ValueError(str(fault)) from fault
+        cfa_tile(self.cfa)
         return self
 
     @property

@@ -40,15 +40,15 @@ class ModelError(AdvisedError):
     """Root of the model's errors; shown to the user as one line."""
 
 
-class SceneError(ModelError):
+class SceneError(ModelError, ValueError):
     """A light field that cannot be read or is not one."""
 
 
-class CameraError(ModelError):
+class CameraError(ModelError, ValueError):
     """A camera description that cannot be built."""
 
 
-class SensingError(ModelError):
+class SensingError(ModelError, ValueError):
     """An imaging matrix, or data given to it, that does not fit."""
 
 

@@ -19,6 +19,7 @@ import yaml
 from numpy.typing import NDArray
 
 from emmc_rig.model.decoding.regular import HEAD_BYTES, check_regular, file_bytes, not_read
+from emmc_rig.model.errors import AdvisedError
 from emmc_rig.model.json_text import one_line, shown_path
 
 MOST_YAML_BYTES, MOST_VALUES, MOST_NESTED = 1_000_000, 1_000_000, 100
@@ -215,7 +216,7 @@ def stored_arrays(path: Path, error: type[Exception], remedy: str) -> Iterator[S
     try:
         with h5py.File(path, "r") as file:
             yield StoredArrays(file, size)
-    except error:
+    except (error, AdvisedError):
         raise
     except FAULTS as fault:
         if not h5py.is_hdf5(path):

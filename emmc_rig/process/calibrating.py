@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, overload
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,18 +19,20 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.arguments import numbers_of, refusal, required
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera, Offset, Positive
-from emmc_rig.model.sensing import Psi
 from emmc_rig.model.settings import Settings, validated
 from emmc_rig.process.session_calibration import (
     SessionCalibration,
     calibrate_session,
     calibration_metrics,
+    routes_of,
 )
 from emmc_rig.progress import Watcher
 from emmc_rig.session.board_sets import SessionBoards
 from emmc_rig.session.measured_psi import boards_outcome
 from emmc_rig.session.session import Session
 
+ARRAYS = (list, tuple, np.ndarray)
+BOARDS_TAKE = "a list of arrays, DN; a session is given without poses, camera and darks"
 POSES_TAKE = "a list of dicts, one for each whiteboard, such as {'mask_um': (0, 0), 'shot': 0}"
 DARKS_TAKE = "an array (repeat, y, x), or such arrays by their exposure"
 LEAST_MOVED = 0.1
@@ -59,85 +61,68 @@ class Pose(Settings):
     taken_s: float = 0.0
 
 
-@overload
 def calibrate(
-    session: Session | str | Path,
-    method: str = "auto",
-    *,
-    route: str | None = None,
-    sensor: bool = False,
-    watcher: Watcher | None = None,
-) -> SessionCalibration: ...
-
-
-@overload
-def calibrate(
-    session: Sequence[ArrayLike] | np.ndarray,
-    method: Sequence[Mapping[str, Any]],
-    camera: Camera,
-    *,
-    darks: ArrayLike | Mapping[float, ArrayLike],
-) -> tuple[Psi, SessionCalibration]: ...
-
-
-def calibrate(
-    session: Any,
-    method: Any = "auto",
+    whiteboards: Session | str | Path | Sequence[ArrayLike] | np.ndarray,
+    poses: Sequence[Mapping[str, Any]] | None = None,
     camera: Camera | None = None,
     *,
-    route: str | None = None,
     darks: ArrayLike | Mapping[float, ArrayLike] | None = None,
+    method: str = "auto",
     sensor: bool = False,
     watcher: Watcher | None = None,
-) -> SessionCalibration | tuple[Psi, SessionCalibration]:
-    """Return Psi as whiteboards measure it: `calibrate(session)`, or arrays with their poses.
+) -> SessionCalibration:
+    """Return Psi as whiteboards measure it: those of a session, or arrays with their poses.
 
-    Arrays are calibrated by the methods of a session, and judged by those for validation. Of what a
-    session can hold besides, arrays have nothing: boards turned in their plane or with the lamp
-    moved, which tell uneven light from the lens; pinholes of several views at once; whiteboards
-    after the scene, besides what `taken_s` shows of drift. What was not watched for that, the
-    report says. Lamps of three colours are poses with their `lamp`.
+    `calibrate(session)` reads a session of `capture`. `calibrate(whiteboards, poses, camera,
+    darks=darks)` takes arrays of another bench. The result's `psi` is the imaging matrix, its
+    `frames(dn)` makes readings of the bench's raw frames, and its `save(folder)` writes psi.h5 with
+    a report.
 
-    `calibrate(session, method)` returns a calibration; its `psi` is the imaging matrix.
-    `calibrate(whiteboards, poses, camera, darks=darks)` returns that matrix and the calibration,
-    whose `frames(dn)` makes readings of the bench's raw frames. `save(folder)` of a calibration
-    writes psi.h5 with a report.
+    Arrays are calibrated by the methods of a session, and judged by those for validation. A session
+    can also hold whiteboards turned in their plane, with the lamp moved, through pinholes of
+    several views at once, or taken after the scene; the report names what arrays lack of that.
+    Lamps of three colours are poses with their `lamp`.
 
     Args:
-        session: itself, or its folder. Or whiteboards, a list of arrays (repeat, y, x) in DN: at
-            least a reference, of two repeats, one for validation, and as many as the method needs:
-            through the open aperture with the mask in a few places, or through a pinhole of every
-            view.
-        method: parametric, mixed or free; `auto` tries all methods that the whiteboards suffice
-            for, and chooses. Or poses, a dict for each whiteboard with the keys of `Pose`.
-        camera: as designed, of arrays; its noise has the white level.
-        route: an earlier name of `method`.
+        whiteboards: a session, or its folder. Or a list of arrays (repeat, y, x) in DN: at least a
+            reference, of two repeats, one for validation, and as many as the method needs: through
+            the open aperture with the mask in a few places, or through a pinhole of every view.
+        poses: of arrays, a dict for each whiteboard with the keys of `Pose`: lengths in um, times
+            in s, exposures in any unit, the same for all.
+        camera: of arrays, as designed; its noise has the white level in DN.
         darks: of arrays, (repeat, y, x) in DN, the lamp off, at one exposure, or by exposures.
+        method: parametric, mixed or free; `auto` tries all methods that the whiteboards suffice
+            for, and chooses.
         sensor: the figures of a session's sensor too, from its darks and references.
         watcher: is shown the progress of a session's.
 
+    Returns:
+        The calibration. `psi` maps (v, u, y, x, c) to (shot, pixel_y, pixel_x); `held_out_error` is
+        the relative error of the validation whiteboards, without unit.
+
     Raises:
-        AppError: whiteboards without poses, of another size, or fewer than are needed; masks that
-            moved by so little that millimetres were given.
+        AppError: an unknown method; whiteboards without poses, of another size, or fewer than are
+            needed; masks that moved by so little that millimetres were given.
         CalibrationError: whiteboards that are unfit: no lamp, another mask, saturated, unsteady.
-        ArgumentError: an argument of another type.
+        ArgumentError: an argument of another type; poses with a session, or `sensor` with arrays.
     """
-    method = method if route is None else route
-    if camera is None and isinstance(method, str) and not isinstance(session, (list, np.ndarray)):
-        return calibrate_session(session, method, sensor, watcher)
-    required(camera, Camera, "camera", "the camera as designed, emmc_rig.camera(...)")
-    assert camera is not None
-    return _of_arrays(session, method, camera, darks)
+    arrays = isinstance(whiteboards, ARRAYS)
+    if not arrays and all(given is None for given in (poses, camera, darks)):
+        return calibrate_session(whiteboards, method, sensor, watcher)
+    required(whiteboards, ARRAYS, "whiteboards", BOARDS_TAKE)
+    if sensor:
+        raise refusal(sensor, "sensor", "True with a session only, whose darks it needs")
+    return _of_arrays(whiteboards, poses, camera, darks, method)
 
 
 @one_blas_thread()
 def _of_arrays(
-    whiteboards: Any, poses: Any, camera: Camera, darks: Any
-) -> tuple[Psi, SessionCalibration]:
-    """Return Psi of arrays, and its calibration; see `calibrate`."""
+    whiteboards: Any, poses: Any, camera: Any, darks: Any, method: str
+) -> SessionCalibration:
+    """Return the calibration of arrays; see `calibrate`."""
     started = time.perf_counter()
-    required(whiteboards, (list, tuple, np.ndarray), "whiteboards", "a list of arrays, DN")
     required(poses, (list, tuple), "poses", POSES_TAKE)
+    required(camera, Camera, "camera", "the camera as designed, emmc_rig.camera(...)")
     if len(whiteboards) != len(poses):
         raise AppError(f"{len(whiteboards)} whiteboards, and {len(poses)} poses: give one for each")
     stood = [validated(Pose, pose, f"poses[{place}]", AppError) for place, pose in enumerate(poses)]
@@ -148,12 +133,13 @@ def _of_arrays(
     dark = _dark_frames(exposed, camera)
     boards = _sorted_boards(whiteboards, stood, camera, dark)
     k, (rows, columns) = camera.sensor.binning, dark[0].mean_dn.shape
-    outcome = boards_outcome(camera, (k * rows, k * columns), boards, "poses: they have")
-    metrics = calibration_metrics(outcome, camera.title, "", "auto", started)
+    size, routes = (k * rows, k * columns), routes_of(method)
+    outcome = boards_outcome(camera, size, boards, "poses: they have", routes)
+    metrics = calibration_metrics(outcome, camera.title, "", method, started)
     chosen = outcome.calibration
     good = outcome.good if chosen.good is None else chosen.good
     scale = Scale(chosen.psi, chosen.white_dn_per_s, dark, chosen.gain, good)
-    return chosen.psi, SessionCalibration(outcome, chosen, scale, metrics)
+    return SessionCalibration(outcome, chosen, scale, metrics)
 
 
 def _dark_frames(darks: Mapping[float, ArrayLike], camera: Camera) -> tuple[MeanFrame, ...]:

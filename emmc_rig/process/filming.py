@@ -36,7 +36,7 @@ from emmc_rig.model.camera import psi_of_shot
 from emmc_rig.model.files import PART, whole_file, whole_folder
 from emmc_rig.model.frames import Frames
 from emmc_rig.model.json_text import parse_json
-from emmc_rig.model.sensing import Psi, SensingError
+from emmc_rig.model.sensing import Psi
 from emmc_rig.process.cost import (
     BASE_BYTES,
     assumed_grid,
@@ -86,7 +86,6 @@ DONE = "[0-9]*"
 """Names of frames that are done; partial folders have other names."""
 DAMAGED = (
     OSError, ValueError, LookupError, TypeError, EOFError, MemoryError, zlib.error, BadZipFile,
-    ReconstructionError, SensingError,
 )  # fmt: skip
 """Errors of reading a damaged or missing file of an earlier run."""
 STILL = "still_share"

@@ -158,9 +158,12 @@ class SessionCalibration:
 
 
 def calibrate_session(
-    session: Session | str | Path, method: str, sensor: bool, watcher: Watcher | None
+    session: object, method: str, sensor: bool, watcher: Watcher | None
 ) -> SessionCalibration:
-    """Return Psi as a session's whiteboards measure it, see `calibrating.calibrate`."""
+    """Return Psi as a session's whiteboards measure it, see `calibrating.calibrate`.
+
+    Raises ArgumentError unless `session` is a session or its folder.
+    """
     if not isinstance(session, Session):
         takes = "a session, or its folder; or whiteboards as arrays, with poses and a camera"
         session = Session(path_of(session, "session", takes))
@@ -224,11 +227,8 @@ def _method_of(session: Session) -> str:
 def _calibrated(
     session: Session, method: str, sensor: bool, watcher: Watcher, empty: NewArray
 ) -> SessionCalibration:
-    if method not in METHODS:
-        raise AppError(f"method {method}: use one of {', '.join(METHODS)}")
-    started = time.perf_counter()
+    routes, started = routes_of(method), time.perf_counter()
     watcher.begin("frames", None)
-    routes = None if method == "auto" else METHODS[method]
     outcome = session_outcome(session, routes, empty, watcher)
     title = session.header["title"] or session.folder.name
     metrics = calibration_metrics(outcome, title, str(session.folder), method, started)
@@ -246,6 +246,13 @@ def _calibrated(
     scale = scale_of(chosen, session, shots)
     inputs = {**psi_inputs(session), "method": method}
     return SessionCalibration(outcome, chosen, scale, metrics, sheet, inputs)
+
+
+def routes_of(method: str) -> tuple[str, ...] | None:
+    """Return what a method tries, None for all that the whiteboards suffice for; or AppError."""
+    if method not in METHODS:
+        raise AppError(f"method {method}: use one of {', '.join(METHODS)}")
+    return None if method == "auto" else METHODS[method]
 
 
 def calibration_metrics(

@@ -131,7 +131,8 @@ def _head(outcome: Outcome, metrics: Mapping) -> Head:
     if agrees:
         words = "You can use this calibration"
         words += ", and make it better" if outcome.advice else ""
-    good, use = agrees and not outcome.advice, "emmc_rig.reconstruct(psi, report.frames(dn))"
+    good = agrees and not outcome.advice
+    use = "emmc_rig.reconstruct(calibration.psi, calibration.frames(dn))"
     if metrics["session"]:
         use = f"emmc-rig reconstruct {typed(metrics['session'])}"
     advice = outcome.advice or [f"get the light field with this Psi: `{use}`"]

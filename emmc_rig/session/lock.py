@@ -23,7 +23,7 @@ OURS = re.compile(r"\.?(\d{5}|amended-\d+)-")
 """How frames and amended files are called, parts of them too."""
 
 
-class HeldError(AppError):
+class HeldError(AppError, BlockingIOError):
     """Another program writes the session; `holder` says which one."""
 
     def __init__(self, folder: Path, taken: TakenError) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any, Generic, TypeVar
 
-from emmc_rig.errors import AppError, StoppedError
+from emmc_rig.errors import ERRORS, AppError, StoppedError
 from emmc_rig.model.files import write_text
 from emmc_rig.model.json_text import parse_json
 from emmc_rig.progress import Watcher
@@ -151,6 +151,8 @@ def kept_words(out: Path, what: Callable[[], str]) -> Iterator[None]:
         raise StoppedError(
             f"stopped by Ctrl-C; {what()} kept in {out}: run the same command again to go on"
         ) from stop
+    except ERRORS:
+        raise
     except OSError as fault:
         kept = f"; {what()} kept" if what() else ""
         raise AppError(

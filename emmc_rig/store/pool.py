@@ -34,7 +34,7 @@ MOST_LOSSES = 5
 CONNECT_S = 10.0
 
 
-class WorkersError(AppError):
+class WorkersError(AppError, ConnectionError):
     """No worker answers, workers run another version of the program, or all were lost."""
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.decoding.child import only_array
-from emmc_rig.model.errors import SceneError
+from emmc_rig.model.errors import AdvisedError, SceneError
 from emmc_rig.model.json_text import one_line, shown_path
 from emmc_rig.model.lightfield import check_light_field, scaled
 from emmc_rig.model.reading import (
@@ -141,7 +141,7 @@ def stored_shards(folder: Path, error: type[Exception], remedy: str) -> Iterator
     zarr = _zarr()
     try:
         yield StoredGroup(zarr.open_group(folder, mode="r"), folder)
-    except error:
+    except (error, AdvisedError):
         raise
     except MissingShardError as fault:
         why = "a file of it is missing; copy the folder again, or"

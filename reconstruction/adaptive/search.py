@@ -26,7 +26,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from emmc_rig.model.sensing import Psi
 from emmc_rig.reconstruction.adaptive.evidence import (
@@ -432,6 +431,8 @@ def _spline(count: int, every: int) -> NDArray[np.float32]:
     """Return the matrix (every * (count - 1) + 1, count) that interpolates by a cubic spline."""
     if count == 1:
         return np.ones((1, 1), dtype=np.float32)
+    from scipy.interpolate import CubicSpline  # loads for 0.2 s, which listings do not need
+
     between = np.arange(every * (count - 1) + 1) / every
     return CubicSpline(np.arange(count), np.eye(count))(between).astype(np.float32)
 

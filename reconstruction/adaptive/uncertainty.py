@@ -35,7 +35,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from emmc_rig.model.bands import in_views
 from emmc_rig.model.lightfield import sum_of_squares
@@ -188,6 +187,8 @@ def variance_of_mean(
         variance = allowed + predicted(logs) + least
         tails = (FREEDOM + 1) * np.log1p(square / (FREEDOM * variance))
         return float(np.sum(np.log(variance) + tails))
+
+    from scipy.optimize import minimize  # loads for 0.1 s, which listings do not need
 
     logs = minimize(surprise, np.log([0.1, 1.0]), method="Nelder-Mead").x
     over = np.maximum(square - allowed, 0) / np.maximum(predicted(logs), least)

@@ -26,7 +26,7 @@ def session(tmp_path_factory):
 
 @pytest.mark.slow
 def test_psi_on_disk_is_psi_in_memory(session, tmp_path, monkeypatch):
-    whole = emmc.calibrate(session, "free")
+    whole = emmc.calibrate(session, method="free")
     whole.save(tmp_path / "whole")
     monkeypatch.setattr(frames, "BAND_PIXELS", 5 * SIZE[1])
     out = tmp_path / "streamed"

@@ -238,8 +238,8 @@ WAY_IN = """
     psi = emmc.Psi.from_weights(weights)
     camera = emmc.camera(described)
     frames = emmc.frames(dn, dark=dark, white_level=4095, gain=0.8, read_noise=2.5)
-    psi, report = emmc.calibrate(whiteboards, poses, camera, darks=darks)
-    result = emmc.reconstruct(psi, frames)
+    calibration = emmc.calibrate(whiteboards, poses, camera, darks=darks)
+    result = emmc.reconstruct(calibration.psi
 """
 
 

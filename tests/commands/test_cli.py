@@ -80,6 +80,11 @@ def test_who_types_no_command_learns_where_to_start(run, typed):
     assert "Usage: emmc-rig [OPTIONS] COMMAND" in out
 
 
+@pytest.mark.parametrize("group", ["devices", "session"])
+def test_a_group_without_a_command_shows_its_help(run, group):
+    assert done(run(group)) == done(run(group, "--help"))
+
+
 def test_help_is_asked_for_in_three_ways(run):
     wanted = done(run("devices", "jog", "--help"))
     assert wanted == done(run("devices", "jog", "-h")) == done(run("help", "devices", "jog"))
@@ -107,6 +112,65 @@ def test_each_help_ends_with_two_examples_that_can_be_typed(run):
     assert not unused
     out = done(run("devices", "jog", "-h"))
     assert out.rstrip().endswith("emmc-rig devices jog x --to 12000 --rig bench.yaml")
+
+
+def _wrong(words, err):
+    """Assert that wrong usage is said in one line, which names the help of the same command."""
+    assert err.count("\n") == 1, err
+    assert err.startswith("emmc-rig: "), err
+    assert err.endswith(f"; `{' '.join(('emmc-rig', *words))} -h` shows what it takes\n"), err
+
+
+def test_wrong_usage_of_every_command_is_a_line_and_code_2(run):
+    required = 0
+    groups = [(), ("devices",), ("session",)]
+    every = dict(_leaves(typer.main.get_command(cli.app)))
+    for words in (*groups, *every):
+        code, _, err = run(*words, "--nosuch")
+        assert (code, "no such option: --nosuch" in err) == (2, True), err
+        _wrong(words, err)
+    for words in groups:
+        code, _, err = run(*words, "nosuch")
+        assert (code, "no such command 'nosuch'" in err) == (2, True), err
+        _wrong(words, err)
+    for words, command in every.items():
+        for option in [known for known in command.params if not getattr(known, "is_flag", True)][
+            :1
+        ]:
+            code, _, err = run(*words, option.opts[-1])
+            assert (code, "requires an argument" in err) == (2, True), err
+            _wrong(words, err)
+        if needed := [known for known in command.params if known.required]:
+            code, _, err = run(*words)
+            assert (code, f"'{needed[0].metavar or needed[0].opts[0]}'" in err) == (2, True), err
+            _wrong(words, err)
+            required += 1
+    assert required > 5
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        (("capture", "--seed", "x"), "'--seed': should be a valid integer"),
+        (("capture", "--seed", "-1"), "'--seed': should be greater than or equal to 0"),
+        (("devices", "jog", "x", "far"), "'distance_um': should be a valid number"),
+        (("devices", "free", "x", "--direction", "left"), "not one of 'up', 'down'"),
+        (("demo", "extra"), "unexpected extra argument"),
+    ],
+)
+def test_a_wrong_number_or_choice_is_a_line_and_code_2(run, typed, said):
+    code, _, err = run(*typed)
+    assert (code, said in err) == (2, True), err
+    _wrong(typed[: 1 + (typed[0] == "devices")], err)
+
+
+def test_paths_are_called_path_in_every_help(run):
+    named = 0
+    for words in dict(_leaves(typer.main.get_command(cli.app))):
+        out = done(run(*words, "-h"))
+        assert not re.search(r"<[^>]*[Pp]ath\]?>|\b(FILE|FOLDER|DIR)\b", out), (words, out)
+        named += "PATH" in out
+    assert named > 15
 
 
 def test_a_shell_completes_commands():

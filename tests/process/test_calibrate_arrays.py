@@ -1,5 +1,8 @@
 """Whiteboards as arrays to Psi, against the Psi that the simulated bench has and its BoardSet's."""
 
+import inspect
+import typing
+
 import numpy as np
 import pytest
 from moved_mask import CAMERA
@@ -61,11 +64,10 @@ def calibrated(taken):
 
 @pytest.mark.slow
 def test_arrays_make_the_psi_of_the_bench(bench, calibrated):
-    psi, report = calibrated
+    psi, report = calibrated.psi, calibrated
     exact = bench.exact_psi(build_imaging_matrix(CAMERA, SIZE))
     assert psi.relative_difference(exact) < 0.02
     assert build_imaging_matrix(CAMERA, SIZE).relative_difference(exact) > 0.1
-    assert report.psi is psi
     assert report.held_out_error < 0.02
     assert "validation error" in repr(report)
 
@@ -91,12 +93,12 @@ def test_arrays_make_the_same_psi_as_the_board_sets_that_a_session_makes(taken, 
     layout = psi_layout(CAMERA, SIZE)
     few = every.with_frames(fitted)
     outcome = calibrate(CAMERA, layout, ("parametric", "mixed"), held_out, few)
-    np.testing.assert_array_equal(calibrated[0].weights, outcome.calibration.psi.weights)
+    np.testing.assert_array_equal(calibrated.psi.weights, outcome.calibration.psi.weights)
 
 
 @pytest.mark.slow
 def test_what_the_bench_reads_of_a_scene_are_frames_by_the_report(bench, calibrated, tmp_path):
-    psi, report = calibrated
+    psi, report = calibrated.psi, calibrated
     scene = emmc.scene("near-planar", size=SIZE, views=(3, 3))
     looking = WhiteboardBench(CAMERA, SIZE, bench.truth, seed=5, scene=scene.light_field)
     dn, exposures_s = looking.capture_scene()
@@ -108,7 +110,10 @@ def test_what_the_bench_reads_of_a_scene_are_frames_by_the_report(bench, calibra
     report.save(tmp_path / "psi")
     np.testing.assert_array_equal(emmc.Psi.load(tmp_path / "psi/psi.h5").weights, psi.weights)
     page = (tmp_path / "psi/report.html").read_text()
-    assert "emmc_rig.reconstruct(psi, report.frames(dn))" in page or report.outcome.advice
+    assert (
+        "emmc_rig.reconstruct(calibration.psi, calibration.frames(dn))" in page
+        or report.outcome.advice
+    )
 
 
 BOARD = np.full((2, *SIZE), 30_000.0)
@@ -152,6 +157,26 @@ MISTAKES = {
         r"whiteboards\[1\]: 100.0% of the pixels are saturated",
     ),
 }
+
+
+def test_what_arrays_and_sessions_do_not_take_is_refused():
+    with pytest.raises(TypeError, match=r"whiteboards: got .*a session is given without poses"):
+        emmc.calibrate("plan-session", "free")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="sensor: got True; it takes True with a session only"):
+        emmc.calibrate([BOARD], [{}], CAMERA, darks=DARK, sensor=True)
+    with pytest.raises(TypeError, match="poses: got None"):
+        emmc.calibrate([BOARD], darks=DARK)
+    with pytest.raises(emmc.ERRORS, match="method best: use one of auto, parametric"):
+        emmc.calibrate(GIVEN["whiteboards"], GIVEN["poses"], CAMERA, darks=DARK, method="best")
+
+
+def test_one_signature_says_what_calibrate_takes_and_returns():
+    signature = inspect.signature(emmc.calibrate)
+    names = ["whiteboards", "poses", "camera", "darks", "method", "sensor", "watcher"]
+    assert list(signature.parameters) == names
+    hints = typing.get_type_hints(emmc.calibrate)
+    assert typing.Any not in hints.values()
+    assert hints["return"].__name__ == "SessionCalibration"
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

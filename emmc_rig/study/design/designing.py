@@ -212,7 +212,7 @@ class DesignStudy(Study[Simulation]):
             self.verdict,
             [
                 "try it on a scene of your own: "
-                f"`emmc-rig simulate --camera {typed(self.folder / CAMERA)} --scene FOLDER`",
+                f"`emmc-rig simulate --camera {typed(self.folder / CAMERA)} --scene PATH`",
                 "to have it made, send the mask's GDSII file, which is beside that camera",
             ],
         )

@@ -403,6 +403,6 @@ def _head(results: Mapping[Cell, Mapping]) -> Head:
         ", ".join(f"{name} {db:.2f} dB" for name, db in means.items()),
         [
             "compare methods within a column, and scenarios within a row",
-            "measure on light fields of your own: `emmc-rig tables --scenes FOLDER`",
+            "measure on light fields of your own: `emmc-rig tables --scenes PATH`",
         ],
     )
