@@ -120,7 +120,7 @@ void main() {
       }
     colour = vec4(pow(total / weights, vec3(1.0 / gamma)), 1.0);
   }
-  if (opacity > 0.0) {
+  if (opacity > 0.0 && (first == 0 || opacity < 1.0)) { // a picture is laid over the estimate alone
     vec2 centre = vec2(grid / 2);
     vec4 laid = texture(overlay, (p + surface * (centre - position) + 0.5) / size);
     colour.rgb = mix(colour.rgb, laid.rgb, opacity * laid.a);
@@ -236,7 +236,7 @@ function webgl(canvas) {
       gl.uniform1f(focus, state.focus);
       gl.uniform1f(aperture, state.aperture);
       gl.uniform1f(wipe, state.wipe);
-      gl.uniform1f(opacity, state.overlay < 0 ? 0 : 0.7);
+      gl.uniform1f(opacity, state.overlay < 0 ? 0 : opacityOf(data.overlays[state.overlay]));
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     },
     lay(coloured) {
@@ -270,7 +270,14 @@ function plain(canvas) {
     load() { Object.assign(canvas, { width, height }); laid = null; },
     async compare() {},
     draw() {
+      const overlay = laid && data.overlays[state.overlay];
+      const lay = () => {
+        context.globalAlpha = opacityOf(overlay);
+        context.drawImage(laid, 0, 0);
+        context.globalAlpha = 1;
+      };
       scene(atlases.estimate);
+      if (overlay && opacityOf(overlay) === 1) lay();
       if (atlases.truth && state.wipe > 0) {
         context.save();
         context.beginPath();
@@ -279,11 +286,7 @@ function plain(canvas) {
         scene(atlases.truth);
         context.restore();
       }
-      if (state.overlay >= 0 && laid) {
-        context.globalAlpha = 0.7;
-        context.drawImage(laid, 0, 0);
-        context.globalAlpha = 1;
-      }
+      if (overlay && opacityOf(overlay) < 1) lay();
     },
     lay(coloured) {
       laid = document.createElement("canvas");
@@ -320,11 +323,12 @@ function draw() {
   byId("aperture").value = state.aperture;
   byId("aperture-value").textContent = state.aperture.toFixed(2);
   byId("focus").value = state.focus;
-  byId("focus-value").textContent = `${(state.focus / data.scale).toFixed(2)} px`;
+  byId("focus-value").textContent = [`${(state.focus / data.scale).toFixed(2)} px`, ...depthAt(state.focus)].join(", ");
   byId("wipe").value = state.wipe;
-  const wiping = atlases.truth && state.wipe > 0;
-  for (const id of ["wipe-line", "side-left", "side-right"]) byId(id).hidden = !wiping;
-  if (wiping) {
+  const inside = state.wipe > 0 && state.wipe < 1; // of the picture: each side that there is has its name
+  for (const [id, there] of [["wipe-line", inside], ["side-left", state.wipe > 0], ["side-right", state.wipe < 1]])
+    byId(id).hidden = !atlases.truth || !there;
+  if (atlases.truth && inside) {
     const { left, scale } = shownAt(), stage = byId("stage").getBoundingClientRect();
     byId("wipe-line").style.left = `${left - stage.left + state.wipe * width * scale}px`;
   }
@@ -349,13 +353,20 @@ function depthHere() {
   return data.disparity.low + (code / 255) * (data.disparity.high - data.disparity.low);
 }
 
+// The depth of a disparity in words, where the optics are known: the twin of model/optics.py.
+function depthAt(disparity) {
+  if (!data.optics) return [];
+  const nearness = 1 / data.optics.focus_mm + (disparity / data.scale) * data.optics.per_px;
+  return [nearness > 0 ? `depth ${+(1 / nearness).toPrecision(3)} mm` : "beyond infinity"];
+}
+
 function reading() {
-  const d = depthHere(), here = data.axes ? [] : [`disparity ${(d / data.scale).toFixed(2)} px`];
+  const d = depthHere(), here = data.axes ? [] : [`disparity ${(d / data.scale).toFixed(2)} px`, ...depthAt(d)];
   const middle = [Math.floor(columns / 2), Math.floor(rows / 2)];
   const x = clamp(Math.round(state.x + d * (middle[0] - state.u)), 0, width - 1);
   const y = clamp(Math.round(state.y + d * (middle[1] - state.v)), 0, height - 1);
   data.overlays.forEach((map, k) => {
-    if (map.key === "disparity" || !overlayLevels[k]) return;
+    if (map.key === "disparity" || !map.colours || !overlayLevels[k]) return;
     const at = 4 * (y * width + x), level = overlayLevels[k].data[at] / 255;
     if (!overlayLevels[k].data[at + 3]) { here.push(`${map.label} unknown`); return; }
     const value = map.low + level * (map.high - map.low);
@@ -383,6 +394,9 @@ function drawEpi() {
   other.fillRect(0, state.y, rows, 1);
 }
 
+// A map lets the picture through, a picture (it has no scale of colours) does not.
+const opacityOf = (overlay) => (overlay.colours ? 0.7 : 1);
+
 function colourOf(colours, at) {
   const last = colours.length - 1, place = at * last;
   const k = Math.min(Math.floor(place), last - 1);
@@ -394,9 +408,10 @@ function choose(overlay) {
   if (!overlayLevels[state.overlay]) state.overlay = -1; // until they are decoded
   for (const input of byId("overlays").querySelectorAll("input")) input.checked = +input.value === state.overlay;
   const legend = byId("legend"), map = data.overlays[state.overlay];
-  legend.hidden = !map;
+  legend.hidden = !map?.colours;
   legend.replaceChildren();
-  if (map) {
+  if (map && !map.colours) renderer.lay(overlayLevels[state.overlay]);
+  else if (map) {
     const levels = overlayLevels[state.overlay], coloured = new ImageData(width, height);
     const table = Array.from({ length: 256 }, (_, i) => colourOf(map.colours, i / 255));
     for (let i = 0; i < coloured.data.length; i += 4) {
@@ -571,6 +586,8 @@ function prepareControls() {
   for (const element of document.querySelectorAll(".viewer-with-truth")) element.hidden = !data.truth;
   for (const element of document.querySelectorAll(".viewer-angles")) element.hidden = Boolean(data.axes);
   if (data.axes) nameAxes(data.axes);
+  byId("no-depth").hidden = !data.no_depth;
+  byId("no-depth").textContent = data.no_depth;
   const choices = ["nothing", ...data.overlays.map((map) => map.label)];
   const there = [...byId("overlays").querySelectorAll("label")];
   if (choices.join() === there.map((row) => row.textContent).join()) return; // a choice may have the focus
