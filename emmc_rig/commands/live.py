@@ -126,7 +126,7 @@ def live(
 
 
 def saving_wants(plan: Path | None, rig: str | None) -> str:
-    """Return what saving all that is found wants beside the options given; "" for nothing."""
+    """Return the options that saving needs beside those given, in words; "" for none."""
     from emmc_rig.bench.hardware import SIMULATED
 
     missing = ["`--plan PLAN` (exposure)"] if plan is None else []

@@ -75,7 +75,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
 
 
 def _seen_by(saved: SavedResult) -> Camera | None:
-    """Return the camera of a result's Psi; None where that is not to be found."""
+    """Return the camera of a result's Psi; None without that Psi."""
     of_film, sha256 = "segment" in saved.metrics, saved.metrics.get("psi_sha256")
     for place in psi_places(saved.folder, saved.metrics):
         with suppress(SensingError, AppError):

@@ -119,8 +119,8 @@ class Watch:
     names that it takes. centre_um: place of each axis that centres the mask and opens the aperture.
     design: the camera whose mask is in. light_field: reconstructs while the camera watches. saved:
     files into which the page may write. following: the command to go on with once a plan was
-    saved; "": none is known. wants: what more is needed to save all that is found, in words; "":
-    nothing. Errors of the devices are not raised: they are "trouble" of `state`.
+    saved; "": none is known. wants: options that saving needs beside those given, in words; "" for
+    none. Errors of the devices are not raised: they are "trouble" of `state`.
     """
 
     files: tuple[str, ...] = ("page.html", "page.js", *COMMON_FILES)

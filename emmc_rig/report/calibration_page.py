@@ -271,11 +271,10 @@ def _measured(outcome: Outcome) -> tuple[str, float]:
         "colours": "magma",
     }
     of_middle = f"Its middle, {middle.shape[1]} x {middle.shape[0]} pixels"
-    panels = [
-        _over_sensor("Shadow of the mask", _shrunk(reading, MAP_PX), pixels, shadow),
-        _over_sensor(of_middle, middle, middle.shape, shadow),
-        _over_sensor("Error of Psi, by regions", errors, pixels, of_psi),
-    ]
+    panels = [_over_sensor("Shadow of the mask", _shrunk(reading, MAP_PX), pixels, shadow)]
+    if middle.shape != pixels:
+        panels.append(_over_sensor(of_middle, middle, middle.shape, shadow))
+    panels.append(_over_sensor("Error of Psi, by regions", errors, pixels, of_psi))
     words = part("lead", MEASURED.format(board=board.name))
     return words + _drawn({panel.title: maps_svg([panel]) for panel in panels}), error
 

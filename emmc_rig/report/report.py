@@ -89,8 +89,9 @@ def render(content: ReportContent) -> str:
     if not shows_parallax(axes):
         name = picture_name(axes)
         turning = f"Drag from {name} to {name}; scroll for a mean of several."
-    coded = None if content.frames is None else _coded(content.frames, _shots(content))
-    if coded:
+    coded = None
+    if content.frames is not None:
+        coded = _coded(content.frames, _shots(metrics, content.frames))
         views = grid_name(axes, content.estimate.shape[:2])
         turning = f"{coded.frames} in, {views} out. {turning}"
     warnings = _warnings(content)
@@ -124,7 +125,7 @@ def _about(content: ReportContent) -> str:
 def _sections(content: ReportContent) -> Iterator[Section]:
     """Yield the sections after the viewer, all of them folded; for experts the last."""
     if content.frames is not None:
-        shots = _shots(content)
+        shots = _shots(content.metrics, content.frames)
         words = "1 shot" if shots == 1 else f"{shots} shots"
         yield Section(
             "captured", "What the sensor recorded", _captured(content.frames, content.described),
@@ -171,9 +172,9 @@ class Coded(NamedTuple):
     side: int
 
 
-def _shots(content: ReportContent) -> int:
-    """Return how many shots the light field was computed from."""
-    return content.metrics.get("shots", len(content.frames))
+def _shots(metrics: Mapping[str, Any], frames: Array) -> int:
+    """Return the number of shots that the light field was computed from."""
+    return metrics.get("shots", len(frames))
 
 
 def _coded(frames: Array, shots: int) -> Coded:
