@@ -69,7 +69,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     fitting = {name: values for name, values in maps.items() if _fits(values, light_field.shape)}
     return Export(
         folder.resolve().name, caption, light_field, true, metrics=metrics, source=spec, **{
-            name: fitting.get(name) for name in ("disparity", "sigma", "misfit")
+            name: fitting.get(name) for name in ("disparity", "disparity_sigma", "sigma", "misfit")
         }, view_axes=axes, camera=camera,
     )  # fmt: skip
 

@@ -27,10 +27,11 @@ Array = NDArray[np.floating]
 class Export:
     """What is written: a light field (v, u, y, x, c), linear, in [0, 1], and its maps if any.
 
-    disparity: (y, x) of the centre view, pixels per view step. sigma: standard deviation
-    (v, u, y, x). misfit: (y, x), readings missed, in deviations of their noise. truth: as
-    light_field. caption: one line. metrics: what metrics.json says of a result. source: what was
-    opened, as typed. view_axes: what rows and columns of views are. camera: that took it, if known.
+    disparity, disparity_sigma: (y, x) of the centre view and its deviation, pixels per view step.
+    sigma: standard deviation (v, u, y, x). misfit: (y, x), readings missed, in deviations of their
+    noise. truth: as light_field. caption: one line. metrics: as in metrics.json of a result.
+    source: what was opened, as typed. view_axes: what rows and columns of views are. camera: that
+    took it, if known.
     """
 
     title: str
@@ -44,6 +45,7 @@ class Export:
     source: str = ""
     view_axes: ViewAxes = ANGLES
     camera: Camera | None = None
+    disparity_sigma: Array | None = None
 
 
 @dataclass(frozen=True)

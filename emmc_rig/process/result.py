@@ -318,6 +318,7 @@ class Result(LightFieldArray):
             self.method, self.verdict.words, self.light_field,
             None if truth is None else np.asarray(truth), self.disparity, self.sigma,
             self.misfit, self.metrics(), view_axes=self.view_axes, camera=self._seen_by(),
+            disparity_sigma=self.maps.get("disparity_sigma"),
         )  # fmt: skip
 
     @cached_property

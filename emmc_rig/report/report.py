@@ -84,6 +84,7 @@ def render(content: ReportContent) -> str:
     export = Export(
         content.title, "", content.estimate, content.truth, disparity, sigma, misfit,
         view_axes=axes, camera=content.described,
+        disparity_sigma=content.maps.get("disparity_sigma"),
     )  # fmt: skip
     turning = "Drag to look from another side, click to focus, scroll to open the aperture."
     if not shows_parallax(axes):

@@ -11,6 +11,7 @@ from browsers import MARKS, complaints, drawn, fits, nameless, on_screen, wait
 
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.format import Export
+from emmc_rig.formats.light_field_array import SEARCH_MISSES
 from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import Lens
 from emmc_rig.model.novel_view import between, sampled
@@ -49,6 +50,7 @@ def written(tmp_path_factory):
         sigma=np.full(scene.light_field.shape[:4], 0.03, np.float32),
         misfit=np.ones(scene.size, np.float32),
         camera=CAMERA,
+        disparity_sigma=np.full(scene.size, 0.2, np.float32),
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(viewer, "sprite", lossless)
@@ -179,7 +181,7 @@ def test_all_in_focus_replaces_the_estimate_and_leaves_the_truth(page, written, 
     data = page_data(written)
     sharp = unpacked({**data, "tile": 1, "views": {**data["views"], "rows": 1, "columns": 1}},
                      data["overlays"][-1]["picture"])[0, 0]  # fmt: skip
-    page.find_element(By.ID, "viewer-picture").send_keys("4")
+    page.find_element(By.ID, "viewer-picture").send_keys("5")
     chosen = page.find_element(By.CSS_SELECTOR, "#viewer-overlays label:has(input:checked)")
     assert chosen.text == "all in focus"
     seen = shown(page, v=2, u=2, aperture=0, wipe=0.5)
@@ -196,9 +198,11 @@ def test_depth_is_that_of_python_under_the_pointer_and_where_it_is_focused(page,
     for x, y in ((width // 4, height // 3), (width // 2, height // 2), (width // 3, height - 9)):
         shown(page, x=x, y=y)
         expected = float(optics.depth_mm(disparities[2, 2, y, x]))
-        said = re.search(r"depth (\d+) mm", state(page))
+        said = re.search(r"depth (\d+) ± ([\d.]+) mm", state(page))
         assert said is not None
         assert float(said[1]) == pytest.approx(expected, abs=0.5 if expected < 1000 else 5)
+        sigma = optics.sigma_mm(np.array(expected), SEARCH_MISSES * np.array(0.2))
+        assert float(said[2]) == pytest.approx(float(sigma), rel=0.06)
     shown(page, focus=0)
     said = page.find_element(By.ID, "viewer-focus-value").text
     assert said == "0.00 px, depth 700 mm"

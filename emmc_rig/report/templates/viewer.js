@@ -353,24 +353,35 @@ function depthHere() {
   return data.disparity.low + (code / 255) * (data.disparity.high - data.disparity.low);
 }
 
-// The depth of a disparity in words, where the optics are known: the twin of model/optics.py.
-function depthAt(disparity) {
+// The depth of a disparity in words, with its deviation, where the optics are known: the twin of model/optics.py.
+function depthAt(disparity, deviation) {
   if (!data.optics) return [];
-  const nearness = 1 / data.optics.focus_mm + (disparity / data.scale) * data.optics.per_px;
-  return [nearness > 0 ? `depth ${+(1 / nearness).toPrecision(3)} mm` : "beyond infinity"];
+  const { focus_mm, per_px } = data.optics, nearness = 1 / focus_mm + (disparity / data.scale) * per_px;
+  if (nearness <= 0) return ["beyond infinity"];
+  const mm = 1 / nearness, away = deviation && ` \u00b1 ${+(mm * mm * per_px * deviation.value).toPrecision(2)}`;
+  return [`depth ${+mm.toPrecision(3)}${away || ""} mm${deviation?.most ? " or more" : ""}`];
+}
+
+// What a map says at a place; most: it ends there. Null where it is unknown or not decoded yet.
+function valueAt(map, x, y) {
+  const levels = overlayLevels[data.overlays.indexOf(map)], at = 4 * (y * width + x);
+  if (!levels?.data[at + 3]) return null;
+  const level = levels.data[at] / 255;
+  return { value: map.low + level * (map.high - map.low), most: level >= 1 };
 }
 
 function reading() {
-  const d = depthHere(), here = data.axes ? [] : [`disparity ${(d / data.scale).toFixed(2)} px`, ...depthAt(d)];
+  const d = depthHere();
   const middle = [Math.floor(columns / 2), Math.floor(rows / 2)];
   const x = clamp(Math.round(state.x + d * (middle[0] - state.u)), 0, width - 1);
   const y = clamp(Math.round(state.y + d * (middle[1] - state.v)), 0, height - 1);
+  const deviation = data.overlays.find((map) => map.key === "disparity_sigma");
+  const here = data.axes ? [] : [`disparity ${(d / data.scale).toFixed(2)} px`, ...depthAt(d, deviation && valueAt(deviation, x, y))];
   data.overlays.forEach((map, k) => {
-    if (map.key === "disparity" || !map.colours || !overlayLevels[k]) return;
-    const at = 4 * (y * width + x), level = overlayLevels[k].data[at] / 255;
-    if (!overlayLevels[k].data[at + 3]) { here.push(`${map.label} unknown`); return; }
-    const value = map.low + level * (map.high - map.low);
-    here.push(`${map.label} ${level >= 1 ? "at least " : ""}${value.toPrecision(2)} ${map.unit}`.trimEnd());
+    if (map.key.startsWith("disparity") || !map.colours || !overlayLevels[k]) return;
+    const found = valueAt(map, x, y);
+    here.push(found ? `${map.label} ${found.most ? "at least " : ""}${found.value.toPrecision(2)} ${map.unit}`.trimEnd()
+      : `${map.label} unknown`);
   });
   return here.join(", ");
 }
@@ -558,7 +569,7 @@ function listen() {
     " ": animate, r: reset, f: full,
   };
   picture.addEventListener("keydown", (event) => {
-    const number = "01234".indexOf(event.key);
+    const number = "012345".indexOf(event.key);
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (number >= 0) choose(number - 1);
     else if (keys[event.key]) keys[event.key]();
