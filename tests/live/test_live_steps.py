@@ -47,8 +47,7 @@ shots:
     ],
 )
 def test_the_command_says_at_its_start_what_saving_wants(plan, rig, wants):
-    said = f"Saving wants {' and '.join(wants)}." if wants else ""
-    assert saving_wants(plan, rig) == said
+    assert saving_wants(plan, rig) == wants
 
 
 def lit_rig(focus_um=None, errors=None):
