@@ -10,7 +10,6 @@ OUT/
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +18,17 @@ from numpy.typing import NDArray
 from emmc_rig.errors import AppError
 from emmc_rig.formats.format import Export, Film
 from emmc_rig.formats.scenes import fine_scene, open_scene, path_in
-from emmc_rig.model.camera import Camera, camera_of
-from emmc_rig.model.errors import SceneError, SensingError, nearest_of
+from emmc_rig.model.errors import SceneError, nearest_of
 from emmc_rig.model.json_text import one_line
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ANGLES
 from emmc_rig.simulators.scenes import SCENES
 from emmc_rig.store.folders import SESSION_RECONSTRUCTION, Listing, is_session
-from emmc_rig.store.psi import StoredPsi, holds_frames, psi_places
+from emmc_rig.store.psi import holds_frames
 from emmc_rig.store.result_files import (
     AGAIN,
     LIGHT_FIELD,
-    SavedResult,
+    camera_of_result,
     holds_light_field,
     read_metrics,
     read_result,
@@ -53,7 +51,7 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
         folder = result_in(folder)
         saved = read_result(folder)
         light_field, maps, axes = saved.light_field, saved.maps, saved.view_axes
-        metrics, camera = saved.metrics, _seen_by(saved)
+        metrics, camera = saved.metrics, camera_of_result(saved)
         caption = _caption(metrics)
     elif not folder.exists() and spec not in SCENES:
         near = nearest_of(spec, SCENES)
@@ -72,17 +70,6 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
             name: fitting.get(name) for name in ("disparity", "disparity_sigma", "sigma", "misfit")
         }, view_axes=axes, camera=camera,
     )  # fmt: skip
-
-
-def _seen_by(saved: SavedResult) -> Camera | None:
-    """Return the camera of a result's Psi; None without that Psi."""
-    of_film, sha256 = "segment" in saved.metrics, saved.metrics.get("psi_sha256")
-    for place in psi_places(saved.folder, saved.metrics):
-        with suppress(SensingError, AppError):
-            psi = StoredPsi(place)
-            if psi.camera_json and (of_film or sha256 in (None, psi.checksum)):
-                return camera_of(psi)
-    return None
 
 
 def _true(spec: str, shape: tuple[int, ...], metrics: Mapping[str, Any]) -> NDArray:

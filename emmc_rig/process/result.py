@@ -33,6 +33,7 @@ from emmc_rig.store.result_files import (
     AGAIN,
     REPORT,
     SavedResult,
+    camera_of_result,
     read_metrics,
     read_result,
     result_in,
@@ -384,6 +385,9 @@ class OpenedResult(Result):
                 "emmc_rig.open_result opens; reconstruct it again to have them beside it"
             )
         return read_frames(self.saved.folder)
+
+    def _seen_by(self) -> Camera | None:
+        return camera_of_result(self.saved)
 
     @cached_property
     def misfit(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]
