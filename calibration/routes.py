@@ -88,7 +88,8 @@ class Outcome:
     """Psi by every route asked for, how each does on held-out whiteboards, and the choice.
 
     frames: exposures that each route used. findings: faults of the bench that Psi takes into
-    account. advice: measurements to repeat. unwatched: influences that no whiteboard measured, with
+    account. whiteboard: through the fewest and most central views of those read, the mask's shadow.
+    advice: measurements to repeat. unwatched: influences that no whiteboard measured, with
     the error they may leave. crosstalk: of the colour filters, where it matters.
     """
 
@@ -101,6 +102,7 @@ class Outcome:
     mixed: Parametric | None
     good: NDArray[np.bool_]
     advice: tuple[str, ...]
+    whiteboard: Board
     findings: tuple[str, ...] = ()
     unwatched: tuple[str, ...] = ()
     crosstalk: Crosstalk | None = None
@@ -190,10 +192,17 @@ def calibrate(
         mixed=modelled.models.get("mixed"),
         good=readings.good,
         advice=tuple(advice),
+        whiteboard=min([*readings.seen, *readings.judges], key=_opening_around_centre),
         findings=tuple(findings),
         unwatched=tuple(_list_unwatched(task, modelled, levels, calibrations[chosen.route])),
         crosstalk=task.crosstalk,
     )
+
+
+def _opening_around_centre(board: Board) -> tuple[int, float, int]:
+    """Return how many views a whiteboard opens, how far from the centre they lie, and its shot."""
+    away = np.argwhere(board.views_open) - (np.array(board.views_open.shape) - 1) / 2
+    return len(away), float(np.square(away).sum()), board.shot
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,15 +98,17 @@ def live(
         psi = psi or DESIGN
     if method is not None and psi is None:
         raise typer.BadParameter("--method needs --psi")
-    listening = listening_socket(host, port)
+    listening, wants = listening_socket(host, port), "" if read_only else saving_wants(plan, rig)
     with closing(listening), ExitStack() as opened:
         with shown_progress("open the devices"):
             watch = opened.enter_context(
-                _watch(rig, camera, stage, design, scene, size, psi, method, plan)
+                _watch(rig, camera, stage, design, scene, size, psi, method, plan, wants)
             )
         token = new_token()
         found = address(host, listening.getsockname()[1], token)
         tell(found)
+        if wants:
+            tell(wants.replace("`", ""))
         hosts = names_of(host)
         if hosts != LOCAL_HOSTS:
             does = "look" if read_only else "look and move the stage"
@@ -123,6 +125,16 @@ def live(
             tell("ended; the stage does not move")
 
 
+def saving_wants(plan: Path | None, rig: str | None) -> str:
+    """Return the options that saving needs beside those given, in words; "" for none."""
+    from emmc_rig.bench.hardware import SIMULATED
+
+    missing = ["`--plan PLAN` (exposure)"] if plan is None else []
+    if rig in (None, SIMULATED):
+        missing.append("`--rig FILE` (centre, mask, focus)")
+    return f"Saving wants {' and '.join(missing)}." if missing else ""
+
+
 @contextmanager
 def _watch(
     rig: str | None,
@@ -134,6 +146,7 @@ def _watch(
     psi: str | None,
     method: str | None,
     plan: Path | None,
+    wants: str,
 ) -> Iterator[Watch]:
     """Yield a Watch over opened devices, which end with it."""
     from emmc_rig.bench.hardware import SIMULATED
@@ -156,7 +169,7 @@ def _watch(
         field = _light_field(psi, scale, method, described, devices.camera.shape)
         watch = Watch(
             devices.camera, devices.stage, devices.place, devices.targets, devices.centre_um,
-            described, field, files, following,
+            described, field, files, following, wants,
         )  # fmt: skip
         stack.callback(watch.close)
         yield watch

@@ -28,6 +28,7 @@ from emmc_rig.store.psi import holds_frames
 from emmc_rig.store.result_files import (
     AGAIN,
     LIGHT_FIELD,
+    camera_of_result,
     holds_light_field,
     read_metrics,
     read_result,
@@ -45,12 +46,12 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     keep theirs. Raises AppError or SceneError.
     """
     folder = path_in(spec)
-    axes = ANGLES
+    axes, camera = ANGLES, None
     if is_session(folder) or holds_frames(folder) or holds_light_field(folder):
         folder = result_in(folder)
         saved = read_result(folder)
         light_field, maps, axes = saved.light_field, saved.maps, saved.view_axes
-        metrics = saved.metrics
+        metrics, camera = saved.metrics, camera_of_result(saved)
         caption = _caption(metrics)
     elif not folder.exists() and spec not in SCENES:
         near = nearest_of(spec, SCENES)
@@ -66,8 +67,8 @@ def open_export(spec: str, truth: str | None = None, size: tuple[int, int] | Non
     fitting = {name: values for name, values in maps.items() if _fits(values, light_field.shape)}
     return Export(
         folder.resolve().name, caption, light_field, true, metrics=metrics, source=spec, **{
-            name: fitting.get(name) for name in ("disparity", "sigma", "misfit")
-        }, view_axes=axes,
+            name: fitting.get(name) for name in ("disparity", "disparity_sigma", "sigma", "misfit")
+        }, view_axes=axes, camera=camera,
     )  # fmt: skip
 
 

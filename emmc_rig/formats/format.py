@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,6 +17,9 @@ from emmc_rig.errors import AppError
 from emmc_rig.model.view_axes import ANGLES, ViewAxes, picture_name, shows_parallax
 from emmc_rig.progress import Watcher
 
+if TYPE_CHECKING:
+    from emmc_rig.model.camera import Camera
+
 Array = NDArray[np.floating]
 
 
@@ -23,10 +27,11 @@ Array = NDArray[np.floating]
 class Export:
     """What is written: a light field (v, u, y, x, c), linear, in [0, 1], and its maps if any.
 
-    disparity: (y, x) of the centre view, pixels per view step. sigma: standard deviation
-    (v, u, y, x). misfit: (y, x), readings missed, in deviations of their noise. truth: as
-    light_field. caption: one line. metrics: what metrics.json says of a result. source: what was
-    opened, as typed. view_axes: what rows and columns of views are.
+    disparity, disparity_sigma: (y, x) of the centre view and its deviation, pixels per view step.
+    sigma: standard deviation (v, u, y, x). misfit: (y, x), readings missed, in deviations of their
+    noise. truth: as light_field. caption: one line. metrics: as in metrics.json of a result.
+    source: what was opened, as typed. view_axes: what rows and columns of views are. camera: that
+    took it, if known.
     """
 
     title: str
@@ -39,6 +44,8 @@ class Export:
     metrics: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
     view_axes: ViewAxes = ANGLES
+    camera: Camera | None = None
+    disparity_sigma: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -61,10 +61,11 @@ function troubleLines() {
 }
 
 // The same, where `so` is what somebody types.
-function writeWithCode(id, text) {
-  if ($(id).dataset.text === text) return;
-  $(id).dataset.text = text;
-  fill($(id), text.split("`").map((part, i) => i % 2 ? cell("code", part) : part));
+function writeWithCode(id, text) { putWithCode($(id), text); }
+function putWithCode(element, text) {
+  if (element.dataset.text === text) return;
+  element.dataset.text = text;
+  fill(element, text.split("`").map((part, i) => i % 2 ? cell("code", part) : part));
 }
 
 function drawTrouble() {

@@ -360,6 +360,7 @@ class Pictures:
         """Return what the viewer reads, JSON."""
         data = viewer_data(self.export, most_pixels=PART_PIXELS)
         data["scale"] = float(str(data["scale"])) / self.block
+        data["no_depth"] = ""  # live light fields are to set up by
         return json.dumps(data, allow_nan=False, separators=(",", ":")).encode()
 
 

@@ -31,6 +31,7 @@ function draw() {
   write("frame", state.frame ? `frame ${state.frame}` : "waiting for the first frame");
   drawSetting("exposure", 1e3 * settings.exposure_s, settings.exposure_limits_s.map((s) => 1e3 * s), "ms");
   drawSetting("gain", settings.gain, settings.gain_limits, "");
+  drawWants();
   drawTargets();
   drawAxes();
   drawSteps();
@@ -75,6 +76,13 @@ function drawHint() {
   drawNext(!$("hint").hidden);
 }
 
+// What saving wants is said at the start, until somebody hides it.
+let wantsSeen = false;
+function drawWants() {
+  $("wants").hidden = wantsSeen || !state.wants;
+  writeWithCode("wants-text", state.wants);
+}
+
 // The first step that is not done; where hands do it, the button is that of the next step with one.
 let nextStep = -1;
 function drawNext(hinted) {
@@ -114,7 +122,7 @@ function drawSteps() {
   state.steps.forEach((step, i) => {
     const [, need, words, press] = parent.children[i].children;
     need.hidden = step.done;
-    put(words, step.text);
+    putWithCode(words, step.text);
     put(press, label(step));
     press.hidden = !label(step);
     press.disabled = state.read_only || (state.busy !== "" && step.action !== "autoexpose");
@@ -308,6 +316,7 @@ for (const [id, send] of [
     field.blur();
   });
 }
+$("wants-close").addEventListener("click", () => { wantsSeen = true; drawWants(); });
 $("take").addEventListener("click", () => act("reference", { taken: !state.reference }));
 $("next-do").addEventListener("click", () => doStep(nextStep));
 $("hint-do").addEventListener("click", () => act(state.hint.action, state.hint.values));

@@ -45,19 +45,20 @@ def steps(
     takes: Sequence[str],
     written: Sequence[str],
     hint: Mapping[str, Any] | None,
+    wants: str,
 ) -> list[Step]:
     """Return name, condition (need), state (done), text and action of every step.
 
     figures, mask: of the page's state. off_um: by axis, its distance from the centre of the mask or
     aperture; None: not homed. axes: of the stage. takes: kinds of values that can be saved.
-    written: files that were saved. hint: for the next step.
+    written: files that were saved. hint: for the next step. wants: see `Watch`.
     """
     return [
         _centre(off_um, axes, figures),
         _exposure(figures, hint),
         _align(mask, found),
         _focus(FOCUS in axes, found),
-        _save(takes, written),
+        _save(takes, written, wants),
     ]
 
 
@@ -65,8 +66,8 @@ def _step(name: str, done: bool, text: str, action: str = "", **more: Any) -> St
     return {"need": NEEDS[name], "name": name, "done": done, "text": text, "action": action, **more}
 
 
-def _save(takes: Sequence[str], written: Sequence[str]) -> Step:
-    text = "to write it into your files start the page with a plan and a file of devices"
+def _save(takes: Sequence[str], written: Sequence[str], wants: str) -> Step:
+    text = wants
     if takes and written:
         text = f"wrote {', '.join(Path(path).name for path in written)}"
     elif takes:

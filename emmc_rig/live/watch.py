@@ -119,7 +119,8 @@ class Watch:
     names that it takes. centre_um: place of each axis that centres the mask and opens the aperture.
     design: the camera whose mask is in. light_field: reconstructs while the camera watches. saved:
     files into which the page may write. following: the command to go on with once a plan was
-    saved; "": none is known. Errors of the devices are not raised: they are "trouble" of `state`.
+    saved; "": none is known. wants: options that saving needs beside those given, in words; "" for
+    none. Errors of the devices are not raised: they are "trouble" of `state`.
     """
 
     files: tuple[str, ...] = ("page.html", "page.js", *COMMON_FILES)
@@ -135,13 +136,14 @@ class Watch:
         light_field: LiveLightField | None = None,
         saved: Files | None = None,
         following: str = "",
+        wants: str = "",
     ) -> None:
         self._camera, self._look, self.targets = camera, look, targets
         axes = () if stage is None else stage.axes
         self._centre_um = {a: um for a, um in (centre_um or {}).items() if a in axes}
         self._design = design
         self.light_field = light_field
-        self._saved, self._following = saved or Files(), following
+        self._saved, self._following, self._wants = saved or Files(), following, wants
         self._found = Found()
         self._written: list[str] = []
         self._shown: Shown | None = None
@@ -196,6 +198,7 @@ class Watch:
             "steps": [],
             "takes": self._saved.takes,
             "next": self._following,
+            "wants": self._wants,
         }
 
     def _order_table(self) -> dict[str, Order]:
@@ -447,7 +450,7 @@ class Watch:
                 off_um[axis] = None if at_um is None else at_um - self._centre_um[axis]
         listed = steps(
             self.state["figures"], self.state["mask"], off_um, axes, self._found,
-            self._saved.takes, self._written, hint,
+            self._saved.takes, self._written, hint, self._wants,
         )  # fmt: skip
         return {"hint": hint, "steps": listed}
 

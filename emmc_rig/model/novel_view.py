@@ -163,7 +163,8 @@ def all_in_focus(light_field: Array, disparity: Array) -> NDArray[np.float32]:
         down, right = np.float32(v - views[0] // 2), np.float32(u - views[1] // 2)
         view = np.ascontiguousarray(light_field[v, u], np.float32)
         place = x + disparity * right, y + disparity * down
-        at.append(cv2.remap(view, *place, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+        moved = cv2.remap(view, *place, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        at.append(moved.reshape(view.shape))  # OpenCV drops the axis of a single colour
     seen = np.stack(at)
     apart = np.square(seen - centre_view(light_field)).sum(axis=-1, keepdims=True)
     weights = np.exp(-apart / np.float32(2 * np.median(apart) + 1e-12))

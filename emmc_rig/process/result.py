@@ -28,11 +28,12 @@ from emmc_rig.reconstruction.result import Reconstruction, Status
 from emmc_rig.reconstruction.verdict.kept import missed_readings
 from emmc_rig.reconstruction.verdict.rules import Verdict
 from emmc_rig.store.folders import result_folder
-from emmc_rig.store.psi import FRAMES, PSI, StoredPsi, holds_frames, psi_beside, read_frames
+from emmc_rig.store.psi import FRAMES, PSI, StoredPsi, holds_frames, psi_places, read_frames
 from emmc_rig.store.result_files import (
     AGAIN,
     REPORT,
     SavedResult,
+    camera_of_result,
     read_metrics,
     read_result,
     result_in,
@@ -317,7 +318,8 @@ class Result(LightFieldArray):
         return Export(
             self.method, self.verdict.words, self.light_field,
             None if truth is None else np.asarray(truth), self.disparity, self.sigma,
-            self.misfit, self.metrics(), view_axes=self.view_axes,
+            self.misfit, self.metrics(), view_axes=self.view_axes, camera=self._seen_by(),
+            disparity_sigma=self.maps.get("disparity_sigma"),
         )  # fmt: skip
 
     @cached_property
@@ -363,12 +365,10 @@ class OpenedResult(Result):
     def psi(self) -> Psi:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The imaging matrix; raises AppError where it is neither in the folder nor as named."""
         folder, known = self.saved.folder.absolute(), self.saved.metrics
-        of_film = "segment" in known
-        beside = psi_beside(folder.parents[1] if of_film else folder)
-        for path in (beside, Path(known.get("psi_file", beside))):
+        for path in psi_places(folder, known):
             if path.exists():
                 psi = StoredPsi(path).load()
-                if of_film:
+                if "segment" in known:
                     psi = psi_of_shot(psi, known["shot"] - 1)
                 if known.get("psi_sha256") in (None, psi.checksum()):
                     return psi
@@ -385,6 +385,9 @@ class OpenedResult(Result):
                 "emmc_rig.open_result opens; reconstruct it again to have them beside it"
             )
         return read_frames(self.saved.folder)
+
+    def _seen_by(self) -> Camera | None:
+        return camera_of_result(self.saved)
 
     @cached_property
     def misfit(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.routes import Outcome
 from emmc_rig.calibration.sensor import SensorSheet
 from emmc_rig.model.files import write_text
+from emmc_rig.model.sensing import Psi
 from emmc_rig.report.display import finite, round_up
 from emmc_rig.report.maps import Map, maps_svg, pixel_ticks
 from emmc_rig.report.page import (
@@ -32,18 +33,16 @@ from emmc_rig.report.page import (
 Array = NDArray[np.floating]
 RESIDUAL_SCALE = 5.0
 DETAIL_PX = 40
-"""Side of the piece of a slice of Psi that is shown pixel for pixel."""
-THUMBNAIL_PX = 120
-"""Side of a whole slice."""
-MAP_PX = 640
-"""Longest side of a residual map; larger ones are shown averaged."""
+"""Side of the piece of the shadow that is shown pixel for pixel."""
+MAP_PX, REGIONS = 640, 24
+"""Longest side of a map of pixels, and of one of regions; larger ones are shown averaged."""
 GOOD_CHI2 = 1.5
 """Validation residual, in variances of the noise, above which something is not modelled."""
 GOOD_BAD_PIXELS = 0.02
 """Share of pixels, from which on a reconstruction is doubted (`reconstruction.verdict.rules`)."""
-PSI_SHOWN = (
-    "How much of the light that an open camera gathers each pixel gets from each view, first shot: "
-    "one tile for each view. An open camera gets 1 / number of views from each."
+MEASURED = (
+    "What a whiteboard reads behind the mask, {board}: 1 is the same pixel with the mask out and "
+    "the aperture open. Beside it the error that the calibration states of Psi, first shot."
 )
 SURE = 2.0
 """Deviations by which a parameter differs from the design before the page says so."""
@@ -94,12 +93,12 @@ def write_calibration_report(
     metrics: as `emmc_rig.calibrate` makes them.
     """
     unwatched = [text.removeprefix("not measured: ") for text in outcome.unwatched]
-    psi, relative_deviation = _psi(outcome)
+    measured, error = _measured(outcome)
     chosen = outcome.judged[outcome.chosen]
     sections = [
         *_listed("found", "Found and taken into account", outcome.findings),
         *_listed("unwatched", "Not measured", unwatched),
-        Section("psi", "Psi", psi),
+        Section("psi", "Shadow and error", measured),
         Section(
             "residuals", "Residuals", _residuals(chosen),
             about="Whiteboards kept from the fit, less what this calibration predicts of them.",
@@ -119,7 +118,7 @@ def write_calibration_report(
     title = f"Calibration of {metrics['camera']}"
     text = framed(
         title, sections=sections, styles=["calibration.css"], head=_head(outcome, metrics),
-        lead=part("cards", _cards(outcome, metrics, relative_deviation)),
+        lead=part("cards", _cards(outcome, metrics, error)),
     )  # fmt: skip
     write_text(path, text)
 
@@ -139,7 +138,7 @@ def _head(outcome: Outcome, metrics: Mapping) -> Head:
     return Head(words, outcome.why, advice, "good" if good else "watch")
 
 
-def _cards(outcome: Outcome, metrics: Mapping, relative_deviation: float) -> list[Card]:
+def _cards(outcome: Outcome, metrics: Mapping, error: float) -> list[Card]:
     judged, bad = outcome.judged[outcome.chosen], metrics["bad_pixels"]
 
     def card(label: str, value: str, note: str, good: bool) -> Card:
@@ -152,7 +151,7 @@ def _cards(outcome: Outcome, metrics: Mapping, relative_deviation: float) -> lis
             judged.chi2 < GOOD_CHI2,
         ),
         Card(
-            "Deviation of Psi", f"{relative_deviation:.2%}",
+            "Deviation of Psi", f"{error:.2f}%",
             "standard deviation of its coefficients, over their root mean square",
         ),
         card(
@@ -237,18 +236,13 @@ def _residuals(judged: HeldOut) -> str:
 
     The kinds are in a table, the worst first.
     """
-    (height, width), shown = judged.residual.shape, _shrunk(judged.residual, MAP_PX)
-    drawn = Map(
-        title=judged.route,
-        values=shown,
-        scale=(-RESIDUAL_SCALE, RESIDUAL_SCALE),
-        bar="validation whiteboard less prediction,\nstandard deviations of the noise",
-        colours="blue-red",
-        across="pixel x",
-        down="pixel y",
-        ticks_x=pixel_ticks(width, shown.shape[1]),
-        ticks_y=pixel_ticks(height, shown.shape[0]),
-    )
+    look = {
+        "scale": (-RESIDUAL_SCALE, RESIDUAL_SCALE),
+        "bar": "validation whiteboard less prediction,\nstandard deviations of the noise",
+        "colours": "blue-red",
+    }
+    shown = _shrunk(judged.residual, MAP_PX)
+    drawn = _over_sensor(judged.route, shown, judged.residual.shape, look)
     order = sorted(judged.groups.items(), key=lambda item: -item[1])
     rows = [(name, f"{value:.2f}") for name, value in order]
     heads = ("Validation whiteboard", f"Residual, x noise (good: below {GOOD_CHI2:g})")
@@ -261,49 +255,59 @@ def _drawn(figures: Mapping[str, bytes]) -> str:
     return part("drawings", addresses)
 
 
-def _psi(outcome: Outcome) -> tuple[str, float]:
-    """Return slices of Psi and of its deviation, (v, u, y, x) of the first shot, as pictures.
+def _measured(outcome: Outcome) -> tuple[str, float]:
+    """Return the mask's shadow and the error of Psi as pictures, and the error over all pixels."""
+    board, calibration = outcome.whiteboard, outcome.calibration
+    errors, error = error_of_psi(calibration.psi, calibration.deviation)
+    reading = finite(board.reading)
+    pixels, middle = reading.shape, _centre(reading)
+    shadow = {
+        "scale": (0, round_up(float(np.percentile(reading[board.usable], 99.9)))),
+        "bar": "reading of the whiteboard",
+        "colours": "gray",
+    }
+    of_psi = {
+        "scale": (0, round_up(float(np.nanmax(errors)))),
+        "bar": "standard deviation of coefficients,\n% of their root mean square",
+        "colours": "magma",
+    }
+    of_middle = f"Its middle, {middle.shape[1]} x {middle.shape[0]} pixels"
+    panels = [_over_sensor("Shadow of the mask", _shrunk(reading, MAP_PX), pixels, shadow)]
+    if middle.shape != pixels:
+        panels.append(_over_sensor(of_middle, middle, middle.shape, shadow))
+    panels.append(_over_sensor("Error of Psi, by regions", errors, pixels, of_psi))
+    words = part("lead", MEASURED.format(board=board.name))
+    return words + _drawn({panel.title: maps_svg([panel]) for panel in panels}), error
 
-    The second is the root mean square deviation of that shot's coefficients over theirs.
+
+def error_of_psi(psi: Psi, deviation: Array) -> tuple[Array, float]:
+    """Return the error that is stated of Psi, by regions of the sensor (y, x), and over all pixels.
+
+    The root mean square deviation of the first shot's coefficients over theirs, %.
     """
-    psi, deviation = outcome.calibration.psi, outcome.calibration.deviation
-    views = psi.light_field_shape[:2]
-    slices: list[list[Array]] = [[], [], []]
-    squares = np.zeros(2)
-    for v, u in np.ndindex(views):  # one view in memory at a time
-        planes = [finite(of[0, v, u]) for of in (psi.weights, deviation)]
-        squares += [np.square(plane, dtype=np.float64).sum() for plane in planes]
-        weights, spread = (plane.sum(axis=1) for plane in planes)
-        shown = _shrunk(weights, THUMBNAIL_PX), _centre(weights), _centre(spread)
-        for found, tile in zip(slices, shown, strict=True):
-            found.append(tile)
-    titles = (
-        "Weights, whole field",
-        f"Weights, the middle {slices[1][0].shape[1]} x {slices[1][0].shape[0]} pixels",
-        "Their standard deviation, same pixels",
+    squares: list[Array] = [np.zeros(psi.size), np.zeros(psi.size)]
+    for v, u in np.ndindex(psi.light_field_shape[:2]):  # one view in memory at a time
+        for total, of in zip(squares, (psi.weights, deviation), strict=True):
+            total += np.square(finite(of[0, v, u]), dtype=np.float64).sum(axis=1)
+    least = 1e-6 * float(squares[0].mean()) + 1e-30  # where no light is, no error is known
+    light, missed = (_shrunk(total, REGIONS) for total in squares)
+    known = 100 * np.sqrt(np.where(light > least, missed / np.maximum(light, least), np.nan))
+    return known, 100 * float(np.sqrt(squares[1].sum() / max(squares[0].sum(), least)))
+
+
+def _over_sensor(
+    title: str, values: Array, pixels: tuple[int, ...], look: Mapping[str, Any]
+) -> Map:
+    """Return a map of the sensor, or of a piece of it, of so many pixels (y, x)."""
+    return Map(
+        title=title,
+        values=values,
+        across="pixel x",
+        down="pixel y",
+        ticks_x=pixel_ticks(pixels[1], values.shape[1]),
+        ticks_y=pixel_ticks(pixels[0], values.shape[0]),
+        **look,
     )
-    panels = []
-    for tiles, title in zip(slices, titles, strict=True):
-        height, width = tiles[0].shape
-        whole = np.full((views[0] * (height + 2), views[1] * (width + 2)), np.nan, np.float32)
-        for tile, (v, u) in zip(tiles, np.ndindex(views), strict=True):
-            whole[v * (height + 2) :, u * (width + 2) :][:height, :width] = tile
-        of_weights = tiles is not slices[-1]
-        panels.append(
-            Map(
-                title=title,
-                values=whole,
-                scale=(0, round_up(float(np.nanpercentile(whole, 99.9)))),
-                bar="share of the open camera's light" if of_weights else "the same unit",
-                colours="gray" if of_weights else "magma",
-                across="view u",
-                down="view v",
-                ticks_x={(u + 0.5) * (width + 2): str(u) for u in range(views[1])},
-                ticks_y={(v + 0.5) * (height + 2): str(v) for v in range(views[0])},
-            )
-        )
-    relative_deviation = float(np.sqrt(squares[1] / max(squares[0], 1e-30)))
-    return part("lead", PSI_SHOWN) + _drawn({"Psi": maps_svg(panels)}), relative_deviation
 
 
 def _centre(view: Array) -> Array:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from emmc_rig.formats.format import Export
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.files import write_text
-from emmc_rig.model.view_axes import axes_of, middle_name, picture_name, shows_parallax
+from emmc_rig.model.view_axes import axes_of, grid_name, middle_name, picture_name, shows_parallax
 from emmc_rig.reconstruction.verdict.rules import NOISE
 from emmc_rig.report.display import (
     PART_PIXELS,
@@ -25,6 +25,7 @@ from emmc_rig.report.display import (
     png_of,
     reduced,
     round_up,
+    webp_of,
 )
 from emmc_rig.report.page import (
     Card,
@@ -41,6 +42,8 @@ from emmc_rig.store.results import stated_words
 Array = NDArray[np.floating]
 EXPLAINED = 0.25
 """Share of the detail of validation readings below which the card is red."""
+CODED_PIXELS, CODED_QUALITY, MIDDLE_PX = 200_000, 75, 48
+"""Of the coded frame on the first screen, and the side of the piece that is shown beside it."""
 FRAME_PIXELS = 1_500_000
 """Of all frames together, and of the error map; larger ones are shown smaller."""
 
@@ -80,20 +83,26 @@ def render(content: ReportContent) -> str:
     disparity, sigma, misfit = (content.maps.get(name) for name in ("disparity", "sigma", "misfit"))
     export = Export(
         content.title, "", content.estimate, content.truth, disparity, sigma, misfit,
-        view_axes=axes,
+        view_axes=axes, camera=content.described,
+        disparity_sigma=content.maps.get("disparity_sigma"),
     )  # fmt: skip
     turning = "Drag to look from another side, click to focus, scroll to open the aperture."
     if not shows_parallax(axes):
         name = picture_name(axes)
         turning = f"Drag from {name} to {name}; scroll for a mean of several."
+    coded = None
+    if content.frames is not None:
+        coded = _coded(content.frames, _shots(metrics, content.frames))
+        views = grid_name(axes, content.estimate.shape[:2])
+        turning = f"{coded.frames} in, {views} out. {turning}"
     warnings = _warnings(content)
     return framed(
         content.title,
         [_about(content)],
         head=light_field_head(metrics, content.source),
-        lead=part("cards", _cards(content))
-        + (part("notice", "Warnings", warnings) if warnings else "")
-        + part("viewer_section", poster(export, PART_PIXELS), turning),
+        lead=part("viewer_section", poster(export, PART_PIXELS), turning, coded)
+        + part("cards", _cards(content))
+        + (part("notice", "Warnings", warnings) if warnings else ""),
         sections=list(_sections(content)),
         kind="report",
         styles=("viewer.css",),
@@ -117,7 +126,7 @@ def _about(content: ReportContent) -> str:
 def _sections(content: ReportContent) -> Iterator[Section]:
     """Yield the sections after the viewer, all of them folded; for experts the last."""
     if content.frames is not None:
-        shots = content.metrics.get("shots", len(content.frames))
+        shots = _shots(content.metrics, content.frames)
         words = "1 shot" if shots == 1 else f"{shots} shots"
         yield Section(
             "captured", "What the sensor recorded", _captured(content.frames, content.described),
@@ -149,6 +158,37 @@ def _sections(content: ReportContent) -> Iterator[Section]:
     if method:
         about = "Settings and intermediate results, for experts."
         yield Section("method", "Inside the method", part("figures", method), about=about)
+
+
+class Coded(NamedTuple):
+    """What the sensor recorded, as the first screen shows it.
+
+    frames: their number in words. whole, middle: addresses of pictures of the first shot, and of
+    the square in its middle. side: of that square, pixels.
+    """
+
+    frames: str
+    whole: str
+    middle: str
+    side: int
+
+
+def _shots(metrics: Mapping[str, Any], frames: Array) -> int:
+    """Return the number of shots that the light field was computed from."""
+    return metrics.get("shots", len(frames))
+
+
+def _coded(frames: Array, shots: int) -> Coded:
+    """Return the first of frames (shot, y, x) for the first screen."""
+    first = finite(frames[:1])
+    curve, (rows, columns) = DisplayCurve.fitted_to(first), first.shape[1:]
+    side = min(MIDDLE_PX, rows, columns)
+    top, left = (rows - side) // 2, (columns - side) // 2
+    middle = first[0, top : top + side, left : left + side]
+    whole = reduced(first[None, ..., None], CODED_PIXELS)[0, 0, ..., 0]
+    words = "One coded frame" if shots == 1 else f"{shots} coded frames"
+    whole, middle = curve.encode(whole), curve.encode(middle)
+    return Coded(words, webp_of(whole, CODED_QUALITY), png_of(middle), side)
 
 
 def _captured(frames: Array, camera: Camera | None) -> str:

@@ -2,7 +2,8 @@
 
     views and truth   JPEG atlases of all views, as screen codes
     disparity         one PNG atlas of what every view sees, 256 levels
-    overlays          one PNG each, of the centre view: disparity, deviation, residual
+    overlays          one PNG each, of the centre view: disparity, deviation, residual; and the
+                      centre view of all views together, all in focus
 
 `viewer.js` draws with WebGL2, by the formulas of `emmc_rig.model.novel_view`; without it, the
 views themselves by canvas. A pixel between four views takes 12 texture reads where disparity is
@@ -17,7 +18,7 @@ browsers reach a frame of it only by those before.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from math import ceil, sqrt
 from typing import Any
 
@@ -26,9 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.formats.format import Export, Film, Format
+from emmc_rig.formats.light_field_array import SEARCH_MISSES
+from emmc_rig.model.errors import CameraError
 from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import centre_view
-from emmc_rig.model.novel_view import centre_disparity, view_disparities
+from emmc_rig.model.novel_view import all_in_focus, centre_disparity, view_disparities
+from emmc_rig.model.optics import optics_of
 from emmc_rig.model.view_axes import axis_names, grid_name, place_name, shows_parallax
 from emmc_rig.report.display import (
     HEAT,
@@ -151,12 +155,17 @@ def viewer_data(
         float(d) * shrink for d in (np.percentile(centre, (2, 50, 98)) / shrink).tolist()
     )
     map_of = png_of if webp is None else lambda picture: webp_of(picture, MAP_QUALITY)
+    overlays = [_overlay(overlay, shown, map_of) for overlay in overlays_of(content, like)]
 
-    def atlas(views: Array) -> str:
+    def atlas(views: Array, tile: int = TILE_MULTIPLE_PX) -> str:
         picture = three_colours(curve.encode(views))
         if webp is None:
-            return sprite(picture, int(BYTES_PER_PIXEL * picture.size / 3))
-        return webp_of(np.ascontiguousarray(tiled(picture)[..., ::-1]), webp)
+            return sprite(picture, int(BYTES_PER_PIXEL * picture.size / 3), tile)
+        return webp_of(np.ascontiguousarray(tiled(picture, tile)[..., ::-1]), webp)
+
+    if parallax:
+        sharp = all_in_focus(shown, centre)[None, None]
+        overlays.append({"key": "sharp", "label": "all in focus", "picture": atlas(sharp, tile=1)})
 
     return {
         "views": {"rows": rows, "columns": columns, "height": height, "width": width},
@@ -170,8 +179,20 @@ def viewer_data(
             "atlas": map_of(tiled(codes[..., None])[..., 0]), "low": low, "high": low + span,
         },
         "focus": {"low": back - 0.25 * span, "high": front + 0.25 * span, "at": middle},
-        "overlays": [_overlay(overlay, shown, map_of) for overlay in overlays_of(content, like)],
+        "overlays": overlays,
+        **_optics(content),
     }  # fmt: skip
+
+
+def _optics(content: Export) -> dict[str, object]:
+    """Return the optics that turn disparity into depth, or in words what is missing for that."""
+    missing = ""
+    if shows_parallax(content.view_axes):
+        try:
+            return {"optics": asdict(optics_of(content.camera, None)), "no_depth": missing}
+        except CameraError as fault:
+            missing = f"{fault}.".replace("depth", "Depth", 1)
+    return {"optics": None, "no_depth": missing}
 
 
 def curve_of(content: Export) -> DisplayCurve:
@@ -194,6 +215,10 @@ def overlays_of(content: Export, like: Export | None = None) -> list[Overlay]:
         found.append(Overlay("sigma", "standard deviation", "", values, 0, high))
     if content.misfit is not None:
         found.append(Overlay("doubt", "unexplained residual", "x noise", content.misfit, 1.0, 5.0))
+    if content.disparity_sigma is not None and shows_parallax(content.view_axes):
+        values, name = SEARCH_MISSES * content.disparity_sigma, "deviation of disparity"
+        high = round_up(ends([values])[1])
+        found.append(Overlay("disparity_sigma", name, "px per view", values, 0, high))
     scales = overlays_of(like) if like else []
     ends_of = {overlay.key: {"low": overlay.low, "high": overlay.high} for overlay in scales}
     return [replace(overlay, **ends_of.get(overlay.key, {})) for overlay in found]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -79,6 +79,13 @@ class StoredPsi(PsiLayout):
 def psi_beside(folder: Path) -> Path:
     """Return where a folder of frames has its imaging matrix."""
     return folder / (PSI_GROUP if (folder / PSI_GROUP).is_dir() else PSI)
+
+
+def psi_places(folder: Path, metrics: Mapping[str, Any]) -> tuple[Path, Path]:
+    """Return where the Psi of a result may lie: beside it, or a film's; and where it came from."""
+    folder = folder.absolute()
+    beside = psi_beside(folder.parents[1] if "segment" in metrics else folder)
+    return beside, Path(metrics.get("psi_file", beside))
 
 
 def save_shards(psi: Psi, folder: Path) -> None:

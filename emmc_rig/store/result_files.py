@@ -20,12 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.errors import AppError
+from emmc_rig.model.camera import Camera, camera_of
+from emmc_rig.model.errors import SensingError
 from emmc_rig.model.json_text import one_line, parse_json
 from emmc_rig.model.lightfield import load_hdf5, load_view_axes, save_hdf5
 from emmc_rig.model.reading import stored_arrays
 from emmc_rig.model.view_axes import ANGLES, ATTRIBUTE, ViewAxes, axes_from, stored_as
 from emmc_rig.store.folders import SESSION_RECONSTRUCTION, is_session, refuse_missing
-from emmc_rig.store.psi import holds_frames
+from emmc_rig.store.psi import StoredPsi, holds_frames, psi_places
 from emmc_rig.store.results import METRICS
 from emmc_rig.store.shards import load_light_field, stored_shards
 
@@ -86,6 +88,17 @@ def read_result(folder: Path) -> SavedResult:
             axes = axes_from(stored.attributes.get(ATTRIBUTE), group, AppError)
             maps = {name: stored.array(name) for name in stored.names() if name != "light_field"}
     return SavedResult(folder, light_field, maps, metrics, axes)
+
+
+def camera_of_result(saved: SavedResult) -> Camera | None:
+    """Return the camera of a result's Psi, whose head alone is read; None without that Psi."""
+    of_film, sha256 = "segment" in saved.metrics, saved.metrics.get("psi_sha256")
+    for place in psi_places(saved.folder, saved.metrics):
+        with suppress(SensingError, AppError):
+            psi = StoredPsi(place)
+            if psi.camera_json and (of_film or sha256 in (None, psi.checksum)):
+                return camera_of(psi)
+    return None
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:

@@ -4,15 +4,22 @@ import base64
 import html
 import re
 import sys
+from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 import emmc_rig as emmc
+from emmc_rig.formats.exports import open_export
 from emmc_rig.formats.light_field_array import LightFieldArray
+from emmc_rig.model.errors import CameraError
 from emmc_rig.model.lightfield import psnr_db
 from emmc_rig.model.optics import Optics, optics_of
+from emmc_rig.report import viewer
+from emmc_rig.report.display import png_of, tiled
+from emmc_rig.report.viewer import curve_of, viewer_data
 
 LENS = {"distance_mm": 52.0, "aperture_cell_mm": 3.0, "focus_mm": 700.0}
 CAMERA = {"title": "mine", "lens": LENS, "sensor": {"sample_pitch_um": 12.0}}
@@ -32,6 +39,30 @@ def result():
     camera = emmc.camera({**described, "lens": {**described["lens"], "focus_mm": 700.0}})
     psi = camera.psi(scene.size)
     return emmc.reconstruct(psi, camera.expose(scene, psi=psi))
+
+
+def test_the_viewer_has_the_all_in_focus_picture_and_the_optics_of_python(
+    result, tmp_path, monkeypatch
+):
+    def lossless(views, most_bytes, tile=16):
+        return png_of(np.ascontiguousarray(tiled(views, tile)[..., ::-1]))
+
+    monkeypatch.setattr(viewer, "sprite", lossless)
+    result.save(tmp_path / "saved")
+    for export in (result._export(), open_export(str(tmp_path / "saved"))):
+        data: Any = viewer_data(export)
+        sharp = data["overlays"][-1]
+        codes = np.frombuffer(base64.b64decode(sharp["picture"].partition(",")[2]), np.uint8)
+        shown = cv2.imdecode(codes, cv2.IMREAD_COLOR_RGB)
+        np.testing.assert_array_equal(shown, curve_of(export).encode(result.all_in_focus()))
+        np.testing.assert_allclose(
+            Optics(**data["optics"]).depth_mm(result._centre_disparity), result.depth_mm().mm
+        )
+        assert data["no_depth"] == ""
+    with pytest.raises(CameraError) as refused:
+        optics_of(None, None)
+    missing = viewer_data(replace(export, camera=None))["no_depth"]
+    assert missing.lower() == f"{refused.value}.".lower()
 
 
 def sheared(disparity_px, size=(40, 60), noise=0.0):

@@ -27,6 +27,7 @@ from selenium.webdriver.common.keys import Keys
 pytestmark = MARKS
 
 TOKEN = "a-secret"
+WANTS = "Saving wants `--plan PLAN` (exposure)."
 WIDTH = "return document.getElementById('viewer-picture').width"
 
 
@@ -46,7 +47,9 @@ def address(rig):
     design = find_camera("rgbw-bayer-1shot")
     field = LiveLightField(designed_scale(design.psi((48, 64))), "tv")
     targets = ("scene", "whiteboard")
-    watch = Watch(rig.camera, rig.stage, rig.attendant.place, targets, centre_um, design, field)
+    watch = Watch(
+        rig.camera, rig.stage, rig.attendant.place, targets, centre_um, design, field, wants=WANTS
+    )
     watch.start()
     with served(application(watch, TOKEN)) as port:
         yield f"http://127.0.0.1:{port}/{TOKEN}/"
@@ -299,6 +302,30 @@ def test_picture_levels_exposure_focus_mask_and_stop_are_in_view_without_scrolli
             wait(page, lambda: page.execute_script(SHOWN) == [])
             back = page.execute_script("return getComputedStyle(document.body).backgroundColor")
             assert (int(back.split("(")[1].split(",")[0]) < 128) == (scheme == "dark")
+
+
+NEXT_BOTTOM = """
+return ["hint", "next"].map((id) => document.getElementById(id).getBoundingClientRect())
+  .filter((box) => box.height).map((box) => box.bottom)
+"""
+
+
+@pytest.mark.parametrize("kind", ["colour", "views"])
+def test_a_phone_shows_the_next_step_and_what_saving_wants_without_scrolling(page, kind):
+    with on_screen(page, 390, 844):
+        page.execute_script("scrollTo(0, 0); act('centre')")
+        press = f"[data-show={kind}]"
+        wait(page, lambda: page.find_element(By.CSS_SELECTOR, press).is_displayed())
+        click(page, press)
+        wait(page, lambda: page.execute_script("return state.figures && !state.busy"))
+        wait(page, lambda: len(page.execute_script(NEXT_BOTTOM)) == 1)
+        assert page.execute_script(NEXT_BOTTOM)[0] < 500
+        shown = text(page, "wants-text")
+        assert shown == WANTS.replace("`", "")
+        assert page.find_element(By.CSS_SELECTOR, "#steps li:last-child").text.endswith(shown)
+        click(page, "#wants-close")
+        wait(page, lambda: not page.find_element(By.ID, "wants").is_displayed())
+        click(page, "[data-show=colour]")
 
 
 def test_a_black_picture_says_why_and_the_next_step_stands_below_it(page, rig):

@@ -191,7 +191,7 @@ def test_what_stands_still_becomes_exactly_what_reconstruct_gives(one_shot):
     assert shown.export.light_field is refined[0].light_field
     drawn = json.loads(shown.encoded())
     assert drawn["scale"] == 1
-    (missed,) = drawn["overlays"]
+    missed, _ = drawn["overlays"]
     assert missed["label"] == "unexplained residual"
 
 

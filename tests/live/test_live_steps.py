@@ -1,6 +1,7 @@
 """From an unpacked box to a plan: focus and the mask's place are found, and written where asked."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from test_live import until, watching
 from emmc_rig.bench.hardware import Fitted, simulated_rig
 from emmc_rig.bench.rig_config import ImagedRig, rig_description
 from emmc_rig.captures.focus import FocusFound, peak
+from emmc_rig.commands.live import saving_wants
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import fine_scene
@@ -29,6 +31,23 @@ shots:
   - exposure_s: auto       # metered
   - {gain: 2}
 """
+
+
+@pytest.mark.parametrize(
+    ("plan", "rig", "wants"),
+    [
+        (
+            None,
+            None,
+            "Saving wants `--plan PLAN` (exposure) and `--rig FILE` (centre, mask, focus).",
+        ),
+        (None, "rig.yaml", "Saving wants `--plan PLAN` (exposure)."),
+        (Path("plan.yaml"), "simulated", "Saving wants `--rig FILE` (centre, mask, focus)."),
+        (Path("plan.yaml"), "rig.yaml", ""),
+    ],
+)
+def test_the_command_says_at_its_start_what_saving_wants(plan, rig, wants):
+    assert saving_wants(plan, rig) == wants
 
 
 def lit_rig(focus_um=None, errors=None):

@@ -7,10 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from emmc_rig.calibration.boards import Board
 from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.model.camera import build_imaging_matrix
-from emmc_rig.report.calibration_page import PARAMETERS, write_calibration_report
+from emmc_rig.report.calibration_page import (
+    PARAMETERS,
+    REGIONS,
+    error_of_psi,
+    write_calibration_report,
+)
 
 SIZE = (24, 32)
 FITTED = {
@@ -22,6 +28,15 @@ FITTED = {
 }
 
 
+def whiteboard() -> Board:
+    """Return a whiteboard through the centre view alone."""
+    views_open = np.zeros((5, 5), bool)
+    views_open[2, 2] = True
+    reading = np.random.default_rng(1).uniform(0, 0.04, SIZE).astype(np.float32)
+    variance, channels = np.full(SIZE, 1e-6, np.float32), np.full(SIZE, 3, np.uint8)
+    return Board("shot 0, view (2, 2)", reading, variance, channels, views_open, (0.0, 0.0), 0)
+
+
 def written(tmp_path, chi2=0.85, advice=(), undecided=()) -> str:
     """Return the page of a calibration whose validation residual is chi2."""
     psi = build_imaging_matrix(find_camera("rgbw-bayer-1shot"), SIZE)
@@ -31,7 +46,7 @@ def written(tmp_path, chi2=0.85, advice=(), undecided=()) -> str:
     outcome: Any = SimpleNamespace(
         chosen="combined", why="the reason", judged=judged, frames={"combined": 40},
         advice=advice, findings=(), unwatched=(), parametric=True,
-        calibration=SimpleNamespace(psi=psi, deviation=deviation),
+        calibration=SimpleNamespace(psi=psi, deviation=deviation), whiteboard=whiteboard(),
     )  # fmt: skip
     board = {"name": "open", "brightness": 1, "moved_um": (0, 0), "chi2": 1, "outliers": 0}
     metrics = {
@@ -89,9 +104,23 @@ def test_maps_are_drawn_with_axes_and_all_but_psi_is_folded(tmp_path):
     drawn = re.findall(
         r'<img class="shown" src="data:image/svg\+xml;base64,[^"]+" alt="(.*?)"', page
     )
-    assert drawn == ["Psi", "Residual map"]
+    assert drawn == ["Shadow of the mask", "Error of Psi, by regions", "Residual map"]
+    assert "behind the mask, shot 0, view (2, 2): 1 is" in page
     folded = re.findall(r'<details class="folded"><summary><h2>(.*?)</h2>', page)
     assert folded == [
         "Residuals", "Calibration methods", "Mask as fitted",
         "Each whiteboard against the fit", "Provenance",
     ]  # fmt: skip
+
+
+def test_the_error_of_psi_is_by_region_and_in_percent():
+    psi = build_imaging_matrix(find_camera("rgbw-bayer-1shot"), (48, 96))
+    rows, columns = REGIONS // 2, REGIONS
+    share = np.linspace(0.01, 0.04, rows)[:, None] * np.linspace(1, 2, columns)
+    of_pixels = share.repeat(48 // rows, axis=0).repeat(96 // columns, axis=1)
+    deviation = psi.weights * of_pixels[:, None, :]  # (shot, v, u, y, stored colour, x)
+    errors, whole = error_of_psi(psi, deviation)
+    assert errors.shape == (rows, columns)
+    np.testing.assert_allclose(errors, 100 * share, rtol=1e-5)
+    expected = 100 * np.sqrt(np.square(deviation).sum() / np.square(psi.weights).sum())
+    assert whole == pytest.approx(expected, rel=1e-6)

@@ -74,6 +74,21 @@ def test_the_folded_report_is_short_fits_and_shows_the_picture_at_once(page):
         assert top < 700
 
 
+@pytest.mark.parametrize("size", [(1600, 900), (390, 844)])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_first_screen_shows_the_coded_frame_beside_the_light_field(page, size, scheme):
+    with on_screen(page, *size, scheme):
+        page.execute_script("scrollTo(0, 0)")
+        frame, middle = page.find_elements(By.CSS_SELECTOR, ".viewer-coded img")
+        picture = page.find_element(By.ID, "viewer-picture").rect
+        for seen in (frame.rect, middle.rect):
+            assert seen["height"] > 90
+            assert seen["y"] + seen["height"] <= size[1]
+        assert picture["y"] < size[1] - 100
+        assert picture["width"] > frame.rect["width"]
+    assert "2 coded frames in, 5x5 views out." in page.find_element(By.ID, "viewer-section").text
+
+
 def test_a_link_to_a_folded_part_opens_it(page, report):
     page.get(report.as_uri() + "#figures")
     drawn(page)

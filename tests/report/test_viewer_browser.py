@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 from browsers import MARKS, complaints, drawn, fits, nameless, on_screen, wait
 
+from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.format import Export
+from emmc_rig.formats.light_field_array import SEARCH_MISSES
 from emmc_rig.formats.scenes import open_scene
+from emmc_rig.model.camera import Lens
 from emmc_rig.model.novel_view import between, sampled
+from emmc_rig.model.optics import optics_of
 from emmc_rig.report import viewer
 from emmc_rig.report.display import TILE_MULTIPLE_PX, png_of, tiled
 from emmc_rig.report.viewer import render_viewer
@@ -22,6 +26,8 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
 pytestmark = MARKS
+LENS = Lens(distance_mm=52.0, aperture_cell_mm=3.0, focus_mm=700.0)
+CAMERA = find_camera("rgbw-bayer-1shot").model_copy(update={"lens": LENS})
 
 
 def lossless(views, most_bytes, tile=TILE_MULTIPLE_PX):
@@ -43,6 +49,8 @@ def written(tmp_path_factory):
         disparity=scene.disparity_px,
         sigma=np.full(scene.light_field.shape[:4], 0.03, np.float32),
         misfit=np.ones(scene.size, np.float32),
+        camera=CAMERA,
+        disparity_sigma=np.full(scene.size, 0.2, np.float32),
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(viewer, "sprite", lossless)
@@ -150,7 +158,55 @@ def test_the_wipe_shows_the_truth_on_its_left(page, twin):
     half = seen.shape[1] // 2
     assert np.abs(seen[:, :half] - 255 * truth[2, 2, :, :half]).max() <= 1
     assert np.abs(seen[:, half:] - 255 * estimate[2, 2, :, half:]).max() <= 1
-    assert page.find_element(By.ID, "viewer-side-left").is_displayed()
+
+
+def test_the_sides_of_the_wipe_are_named_over_the_picture_wherever_it_stands(page):
+    sides = {name: page.find_element(By.ID, f"viewer-side-{name}") for name in ("left", "right")}
+    stage = page.find_element(By.ID, "viewer-stage").rect
+    button = page.find_element(By.ID, "viewer-full").rect
+    for wipe, named in ((0, ["right"]), (0.5, ["left", "right"]), (1, ["left"])):
+        shown(page, wipe=wipe)
+        assert [name for name, side in sides.items() if side.is_displayed()] == named
+    shown(page, wipe=0.5)
+    assert (sides["left"].text, sides["right"].text) == ("true", "reconstructed")
+    for side in sides.values():
+        assert stage["x"] <= side.rect["x"] < side.rect["x"] + side.rect["width"] < button["x"]
+        assert side.rect["y"] < stage["y"] + 60
+    away = sides["left"].rect["x"] - stage["x"]
+    assert away < 20
+
+
+def test_all_in_focus_replaces_the_estimate_and_leaves_the_truth(page, written, twin):
+    _, truth, *_ = twin
+    data = page_data(written)
+    sharp = unpacked({**data, "tile": 1, "views": {**data["views"], "rows": 1, "columns": 1}},
+                     data["overlays"][-1]["picture"])[0, 0]  # fmt: skip
+    page.find_element(By.ID, "viewer-picture").send_keys("5")
+    chosen = page.find_element(By.CSS_SELECTOR, "#viewer-overlays label:has(input:checked)")
+    assert chosen.text == "all in focus"
+    seen = shown(page, v=2, u=2, aperture=0, wipe=0.5)
+    half = seen.shape[1] // 2
+    assert np.abs(seen[:, half:] - 255 * sharp[:, half:]).max() <= 1
+    assert np.abs(seen[:, :half] - 255 * truth[2, 2, :, :half]).max() <= 1
+    assert not page.find_element(By.ID, "viewer-legend").is_displayed()
+
+
+def test_depth_is_that_of_python_under_the_pointer_and_where_it_is_focused(page, twin):
+    disparities, optics = twin[2], optics_of(CAMERA, None)
+    height, width = disparities.shape[2:]
+    shown(page, v=2, u=2)
+    for x, y in ((width // 4, height // 3), (width // 2, height // 2), (width // 3, height - 9)):
+        shown(page, x=x, y=y)
+        expected = float(optics.depth_mm(disparities[2, 2, y, x]))
+        said = re.search(r"depth (\d+) ± ([\d.]+) mm", state(page))
+        assert said is not None
+        assert float(said[1]) == pytest.approx(expected, abs=0.5 if expected < 1000 else 5)
+        sigma = optics.sigma_mm(np.array(expected), SEARCH_MISSES * np.array(0.2))
+        assert float(said[2]) == pytest.approx(float(sigma), rel=0.06)
+    shown(page, focus=0)
+    said = page.find_element(By.ID, "viewer-focus-value").text
+    assert said == "0.00 px, depth 700 mm"
+    assert not page.find_element(By.ID, "viewer-no-depth").is_displayed()
 
 
 def state(page) -> str:

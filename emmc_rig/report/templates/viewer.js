@@ -120,7 +120,7 @@ void main() {
       }
     colour = vec4(pow(total / weights, vec3(1.0 / gamma)), 1.0);
   }
-  if (opacity > 0.0) {
+  if (opacity > 0.0 && (first == 0 || opacity < 1.0)) { // a picture is laid over the estimate alone
     vec2 centre = vec2(grid / 2);
     vec4 laid = texture(overlay, (p + surface * (centre - position) + 0.5) / size);
     colour.rgb = mix(colour.rgb, laid.rgb, opacity * laid.a);
@@ -236,7 +236,7 @@ function webgl(canvas) {
       gl.uniform1f(focus, state.focus);
       gl.uniform1f(aperture, state.aperture);
       gl.uniform1f(wipe, state.wipe);
-      gl.uniform1f(opacity, state.overlay < 0 ? 0 : 0.7);
+      gl.uniform1f(opacity, state.overlay < 0 ? 0 : opacityOf(data.overlays[state.overlay]));
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     },
     lay(coloured) {
@@ -270,7 +270,14 @@ function plain(canvas) {
     load() { Object.assign(canvas, { width, height }); laid = null; },
     async compare() {},
     draw() {
+      const overlay = laid && data.overlays[state.overlay];
+      const lay = () => {
+        context.globalAlpha = opacityOf(overlay);
+        context.drawImage(laid, 0, 0);
+        context.globalAlpha = 1;
+      };
       scene(atlases.estimate);
+      if (overlay && opacityOf(overlay) === 1) lay();
       if (atlases.truth && state.wipe > 0) {
         context.save();
         context.beginPath();
@@ -279,11 +286,7 @@ function plain(canvas) {
         scene(atlases.truth);
         context.restore();
       }
-      if (state.overlay >= 0 && laid) {
-        context.globalAlpha = 0.7;
-        context.drawImage(laid, 0, 0);
-        context.globalAlpha = 1;
-      }
+      if (overlay && opacityOf(overlay) < 1) lay();
     },
     lay(coloured) {
       laid = document.createElement("canvas");
@@ -320,11 +323,12 @@ function draw() {
   byId("aperture").value = state.aperture;
   byId("aperture-value").textContent = state.aperture.toFixed(2);
   byId("focus").value = state.focus;
-  byId("focus-value").textContent = `${(state.focus / data.scale).toFixed(2)} px`;
+  byId("focus-value").textContent = [`${(state.focus / data.scale).toFixed(2)} px`, ...depthAt(state.focus)].join(", ");
   byId("wipe").value = state.wipe;
-  const wiping = atlases.truth && state.wipe > 0;
-  for (const id of ["wipe-line", "side-left", "side-right"]) byId(id).hidden = !wiping;
-  if (wiping) {
+  const inside = state.wipe > 0 && state.wipe < 1; // of the picture: each side that there is has its name
+  for (const [id, there] of [["wipe-line", inside], ["side-left", state.wipe > 0], ["side-right", state.wipe < 1]])
+    byId(id).hidden = !atlases.truth || !there;
+  if (atlases.truth && inside) {
     const { left, scale } = shownAt(), stage = byId("stage").getBoundingClientRect();
     byId("wipe-line").style.left = `${left - stage.left + state.wipe * width * scale}px`;
   }
@@ -349,17 +353,35 @@ function depthHere() {
   return data.disparity.low + (code / 255) * (data.disparity.high - data.disparity.low);
 }
 
+// The depth of a disparity in words, with its deviation, where the optics are known: the twin of model/optics.py.
+function depthAt(disparity, deviation) {
+  if (!data.optics) return [];
+  const { focus_mm, per_px } = data.optics, nearness = 1 / focus_mm + (disparity / data.scale) * per_px;
+  if (nearness <= 0) return ["beyond infinity"];
+  const mm = 1 / nearness, away = deviation && ` \u00b1 ${+(mm * mm * per_px * deviation.value).toPrecision(2)}`;
+  return [`depth ${+mm.toPrecision(3)}${away || ""} mm${deviation?.most ? " or more" : ""}`];
+}
+
+// What a map says at a place; most: it ends there. Null where it is unknown or not decoded yet.
+function valueAt(map, x, y) {
+  const levels = overlayLevels[data.overlays.indexOf(map)], at = 4 * (y * width + x);
+  if (!levels?.data[at + 3]) return null;
+  const level = levels.data[at] / 255;
+  return { value: map.low + level * (map.high - map.low), most: level >= 1 };
+}
+
 function reading() {
-  const d = depthHere(), here = data.axes ? [] : [`disparity ${(d / data.scale).toFixed(2)} px`];
+  const d = depthHere();
   const middle = [Math.floor(columns / 2), Math.floor(rows / 2)];
   const x = clamp(Math.round(state.x + d * (middle[0] - state.u)), 0, width - 1);
   const y = clamp(Math.round(state.y + d * (middle[1] - state.v)), 0, height - 1);
+  const deviation = data.overlays.find((map) => map.key === "disparity_sigma");
+  const here = data.axes ? [] : [`disparity ${(d / data.scale).toFixed(2)} px`, ...depthAt(d, deviation && valueAt(deviation, x, y))];
   data.overlays.forEach((map, k) => {
-    if (map.key === "disparity" || !overlayLevels[k]) return;
-    const at = 4 * (y * width + x), level = overlayLevels[k].data[at] / 255;
-    if (!overlayLevels[k].data[at + 3]) { here.push(`${map.label} unknown`); return; }
-    const value = map.low + level * (map.high - map.low);
-    here.push(`${map.label} ${level >= 1 ? "at least " : ""}${value.toPrecision(2)} ${map.unit}`.trimEnd());
+    if (map.key.startsWith("disparity") || !map.colours || !overlayLevels[k]) return;
+    const found = valueAt(map, x, y);
+    here.push(found ? `${map.label} ${found.most ? "at least " : ""}${found.value.toPrecision(2)} ${map.unit}`.trimEnd()
+      : `${map.label} unknown`);
   });
   return here.join(", ");
 }
@@ -383,6 +405,9 @@ function drawEpi() {
   other.fillRect(0, state.y, rows, 1);
 }
 
+// A map lets the picture through, a picture (it has no scale of colours) does not.
+const opacityOf = (overlay) => (overlay.colours ? 0.7 : 1);
+
 function colourOf(colours, at) {
   const last = colours.length - 1, place = at * last;
   const k = Math.min(Math.floor(place), last - 1);
@@ -394,9 +419,10 @@ function choose(overlay) {
   if (!overlayLevels[state.overlay]) state.overlay = -1; // until they are decoded
   for (const input of byId("overlays").querySelectorAll("input")) input.checked = +input.value === state.overlay;
   const legend = byId("legend"), map = data.overlays[state.overlay];
-  legend.hidden = !map;
+  legend.hidden = !map?.colours;
   legend.replaceChildren();
-  if (map) {
+  if (map && !map.colours) renderer.lay(overlayLevels[state.overlay]);
+  else if (map) {
     const levels = overlayLevels[state.overlay], coloured = new ImageData(width, height);
     const table = Array.from({ length: 256 }, (_, i) => colourOf(map.colours, i / 255));
     for (let i = 0; i < coloured.data.length; i += 4) {
@@ -543,7 +569,7 @@ function listen() {
     " ": animate, r: reset, f: full,
   };
   picture.addEventListener("keydown", (event) => {
-    const number = "01234".indexOf(event.key);
+    const number = "012345".indexOf(event.key);
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (number >= 0) choose(number - 1);
     else if (keys[event.key]) keys[event.key]();
@@ -571,6 +597,8 @@ function prepareControls() {
   for (const element of document.querySelectorAll(".viewer-with-truth")) element.hidden = !data.truth;
   for (const element of document.querySelectorAll(".viewer-angles")) element.hidden = Boolean(data.axes);
   if (data.axes) nameAxes(data.axes);
+  byId("no-depth").hidden = !data.no_depth;
+  byId("no-depth").textContent = data.no_depth;
   const choices = ["nothing", ...data.overlays.map((map) => map.label)];
   const there = [...byId("overlays").querySelectorAll("label")];
   if (choices.join() === there.map((row) => row.textContent).join()) return; // a choice may have the focus
