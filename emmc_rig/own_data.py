@@ -14,16 +14,18 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import tifffile
-import yaml
 
 from emmc_rig.bench.hardware import simulated_rig
 from emmc_rig.captures.plan import Boards, Darks, OpenBoard, Plan, PlannedShot
 from emmc_rig.demo import simulated_session
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.scenes import APERTURE_FACTOR, PIXEL_FACTOR, fine_scene
+from emmc_rig.model.errors import CameraError
+from emmc_rig.model.reading import parse_yaml
 from emmc_rig.progress import Watcher
 from emmc_rig.session.board_sets import decoded
 from emmc_rig.session.planned import kind_name
@@ -70,7 +72,7 @@ def write_own_data(folder: Path, seed: int, watcher: Watcher | None = None) -> C
     watcher = watcher or Watcher()
     rng = np.random.default_rng(seed)
     film = np.where(rng.random(CELLS) < 0.5, CLEAR, SHUT)
-    described = yaml.safe_load(CAMERA)
+    described = cast(dict[str, Any], parse_yaml(CAMERA, CAMERA_FILE, CameraError))
     described["sensor"]["noise"]["electrons_per_s"] = ELECTRONS_PER_S
     described["masks"]["film"]["pattern"] = film
     camera = find_camera(described)

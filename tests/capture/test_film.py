@@ -19,6 +19,7 @@ from emmc_rig.captures.film import Ring, refuse_impossible_film
 from emmc_rig.captures.plan import Plan, new_plan, planned_camera
 from emmc_rig.captures.run import estimated
 from emmc_rig.captures.sequencer import Sequencer
+from emmc_rig.drivers.clock import SYSTEM_CLOCK
 from emmc_rig.drivers.dng import encode_dng
 from emmc_rig.drivers.errors import CaptureError
 from emmc_rig.drivers.raw import RawFrame, decode_raw
