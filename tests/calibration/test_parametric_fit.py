@@ -15,10 +15,10 @@ from whiteboard_bench import (
 
 from emmc_rig.calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
 from emmc_rig.calibration.choice import HeldOut, choose
-from emmc_rig.calibration.defects import find_defects, loss_variance, mask_with_losses
+from emmc_rig.calibration.defects import find_defects
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.findings import cause_lines, fit_advice
-from emmc_rig.calibration.fit import FitSettings, fit_placement, shares_of_prior
+from emmc_rig.calibration.fit import fit_placement, shares_of_prior
 from emmc_rig.calibration.locator import register
 from emmc_rig.calibration.parametric import psi_deviation, shot_stages
 from emmc_rig.calibration.placement import (
@@ -26,7 +26,6 @@ from emmc_rig.calibration.placement import (
     Placement,
     Tolerances,
     designed_placement,
-    labels,
 )
 from emmc_rig.calibration.routes import calibrate
 from emmc_rig.calibration.shadow import Shadow, shadow_mask
@@ -111,38 +110,6 @@ def test_brightness_that_repeats_show_to_differ_counts_in_the_fit(design):
     assert less.deviation("clear") == pytest.approx(0.02 / 2 * less.placement.clear, rel=0.2)
     assert known.deviation("clear") < 0.4 * less.deviation("clear")
     assert known.brightness_spread < 0.001 > less.brightness_spread
-
-
-@pytest.mark.slow
-def test_the_noise_of_the_reference_is_that_of_all_whiteboards(design):
-    truth, rng = replace(designed_placement(CAMERA), blur_um=3.0), np.random.default_rng(5)
-    chosen = [labels(VIEWS).index(name) for name in ("clear", "vignetting")]
-    white2 = np.full(SIZE, 0.02**2, np.float32)
-    fits, alone = [], []
-    for seed in range(24):
-        darker = 1 - rng.normal(0, 0.02, SIZE)
-        boards = [
-            replace(
-                board,
-                reading=(board.reading * darker).astype(np.float32),
-                variance=board.variance + np.square(board.reading) * white2,
-            )
-            for board in synthetic(design, truth, seed=seed)
-        ]
-        for shared, found in ((white2, fits), (None, alone)):
-            each = [replace(board, white2=shared) for board in boards]
-            settings = FitSettings(seed=seed, first_pixels=1500)
-            found.append(fit_placement(each, CAMERA, MASK, settings, start=truth))
-    spread = np.std([fit.placement.vector()[chosen] for fit in fits], axis=0, ddof=1)
-    stated, of_own = (
-        np.mean([np.sqrt(np.diag(fit.covariance))[chosen] for fit in found], axis=0)
-        for found in (fits, alone)
-    )
-    # The deviation of 24 is known to 15 %.
-    assert np.all(np.abs(spread / stated - 1) < 0.35)
-    # The level is less sure than if every whiteboard had its own reference, a slope surer.
-    assert stated[0] > 1.2 * of_own[0]
-    assert stated[1] < 0.8 * of_own[1]
 
 
 def test_a_mask_that_is_not_the_design_is_refused_with_the_correlation(design, bench, few):
@@ -239,36 +206,6 @@ def test_deviations_of_psi_do_not_depend_on_the_bands_they_are_computed_in(desig
         found.append(psi_deviation(shadow, design, shot_stages(CAMERA), covariance))
     assert found[0].min() > 0
     np.testing.assert_array_equal(*found)
-
-
-def test_what_the_losses_of_a_speck_leave_unsure_is_that_of_its_grains_together(design):
-    truth = replace(designed_placement(CAMERA), blur_um=3.0)
-    middle = np.array(MASK.cells.shape[1:3]) // 2
-    lost = np.zeros((2 * MASK.cells.shape[1], 2 * MASK.cells.shape[2]))
-    lost[2 * middle[0] : 2 * middle[0] + 2, 2 * middle[1] : 2 * middle[1] + 2] = 0.5
-    boards, soiled = synthetic(design, truth, 0.005), mask_with_losses(MASK, truth, lost)
-    for i, board in enumerate(boards):
-        args = PIXELS, board.channels.ravel(), board.views_open, board.stage_um, board.shot
-        taken = Shadow(MASK, truth).readings(*args) - Shadow(soiled, truth).readings(*args)
-        boards[i] = replace(board, reading=(board.reading - taken.reshape(SIZE)).astype(np.float32))
-    found = find_defects(boards, MASK, truth)
-    assert found.count > 0
-    seen = np.ones(VIEWS, dtype=bool), (0.0, 0.0), 0
-    channels = design.colour[0].ravel()
-    variance = loss_variance(found, MASK, truth, PIXELS, channels, seen)
-    grains = np.flatnonzero(found.lost)
-    dense = found.covariance[grains][:, grains].toarray()
-    root = np.linalg.cholesky(dense + 1e-12 * np.trace(dense) * np.eye(len(grains)))
-    rng, spread = np.random.default_rng(0), []
-    for _ in range(200):
-        drawn = np.zeros(found.lost.size)
-        drawn[grains] = root @ rng.standard_normal(len(grains))
-        other = mask_with_losses(MASK, truth, drawn.reshape(found.lost.shape))
-        spread.append(Shadow(other, truth).readings(PIXELS, channels, *seen))
-    touched = variance > 0.1 * variance.max()
-    ratio = np.var(spread, axis=0)[touched] / variance[touched]
-    # 200 draws tell a variance to 10 %.
-    assert ratio.mean() == pytest.approx(1, abs=0.25)
 
 
 def test_no_defects_are_found_on_a_clean_mask(design):
