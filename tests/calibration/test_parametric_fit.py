@@ -18,13 +18,10 @@ from emmc_rig.calibration.choice import HeldOut, choose
 from emmc_rig.calibration.defects import find_defects
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.findings import cause_lines, fit_advice
-from emmc_rig.calibration.fit import fit_placement, shares_of_prior
+from emmc_rig.calibration.fit import fit_placement
 from emmc_rig.calibration.locator import register
 from emmc_rig.calibration.parametric import psi_deviation, shot_stages
 from emmc_rig.calibration.placement import (
-    SCALARS,
-    Placement,
-    Tolerances,
     designed_placement,
 )
 from emmc_rig.calibration.routes import calibrate
@@ -169,21 +166,6 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     assert float(words[1]) == pytest.approx(far_um, rel=0.1)
     assert "a mask that is not where the stage reports it" in lines.findings[0]
     assert fit.moved_um == pytest.approx(3.0, rel=0.2)
-
-
-def test_a_share_of_the_light_known_to_the_prior_is_as_unsure_as_the_prior():
-    count, tolerances = VIEWS[0] * VIEWS[1], Tolerances()
-    weights = tuple(tuple(row) for row in np.linspace(0.5, 1.5, count).reshape(VIEWS).tolist())
-    covariance = np.zeros((len(SCALARS) + count, len(SCALARS) + count))
-    spread = tolerances.aperture * np.ravel(weights)
-    covariance[-count:, -count:] = np.diag(spread**2)
-    found = shares_of_prior(MASK, Placement(aperture=weights), covariance, tolerances)
-    # Of nine independent logarithms each less their mean: (1 - 1/9) of the variance is left.
-    np.testing.assert_allclose(found[-count:], np.sqrt(8 / 9))
-    assert found[: len(SCALARS)].max() == 0
-    half = shares_of_prior(MASK, Placement(aperture=weights), covariance / 4, tolerances)
-    np.testing.assert_allclose(half[-count:], np.sqrt(8 / 9) / 2)
-    assert len(tolerances.deviations(VIEWS)) == len(found)
 
 
 def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):
