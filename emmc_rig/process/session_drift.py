@@ -137,7 +137,7 @@ def _planes_as_boards(
         values, spread, stored = values.sum(2, keepdims=True), spread.sum(2, keepdims=True), 1
     boards = []
     for v, u, c in np.ndindex(*values.shape[:2], stored):
-        opened = views_open(values.shape[:2], (v, u))
+        opened = views_open(psi.views, (v, u))
         reading, sure = stored * values[v, u, c], stored * spread[v, u, c]
         variance = np.square(sure) + 1e-12
         if good is not None:
