@@ -277,9 +277,9 @@ def possible_causes(
 
 
 def _pinholes(boards: Sequence[Board]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which whiteboards are of some views, and which of these a hand may have moved.
+    """Return whether each whiteboard opens only some views, and whether its pinhole is hand-held.
 
-    Hands may have moved all of them where none is known to be put by hand.
+    If no whiteboard states a hand-held pinhole, every pinhole counts as hand-held.
     """
     few = np.array([through_pinhole(board) for board in boards])
     loose = np.array([board.loose for board in boards])
