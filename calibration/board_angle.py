@@ -25,7 +25,7 @@ from emmc_rig.calibration.choice import white_by_view
 from emmc_rig.calibration.fit import Fit
 from emmc_rig.calibration.placement import SCALARS
 from emmc_rig.calibration.robust import deviation_of
-from emmc_rig.calibration.shadow import Shadow, ShadowMask
+from emmc_rig.calibration.shadow import Shadow, ShadowMask, far_shares
 from emmc_rig.calibration.whiteboard import Calibration
 from emmc_rig.model.sensing import Psi
 
@@ -234,15 +234,14 @@ def leaning(fit: Fit, mask: ShadowMask, board: BoardAngle | None) -> Leaning:
     either side. No lens is known well enough to say that what falls alike on every side is too
     much, and no turn of the board tells it apart.
     """
-    views = np.shape(fit.placement.aperture)
-    v, u = (np.linspace(-1, 1, count) if count > 1 else np.zeros(1) for count in views)
-    far = (v[:, None] ** 2 + u**2) / max(float((v[:, None] ** 2 + u**2).max()), 1e-12)
+    views = mask.views
+    across, down, *_ = _radiance_terms(views, 0.0)
+    far = far_shares(views)
     through = 1 + fit.placement.falloff * far
     sent = board.radiance if board is not None and board.uneven else np.ones(views)
     weights = (np.array(fit.placement.aperture) * through / sent).ravel()
     weights = weights / weights.mean()
-    smooth = [np.broadcast_to(term, views).ravel() for term in (far, v[:, None], u[None, :])]
-    columns = np.stack([term - term.mean() for term in smooth], axis=1)
+    columns = np.stack([(term - term.mean()).ravel() for term in (far, down, across)], axis=1)
     columns = columns[:, np.ptp(columns, axis=0) > 0]
     freedom = weights.size - columns.shape[1] - 1
     if freedom < columns.shape[1] or not columns.shape[1]:

@@ -145,24 +145,6 @@ class BoardSet:
         )
 
 
-@dataclass(frozen=True)
-class Rows:
-    """How rows err alike from frame to frame, as a whiteboard's dark shows.
-
-    own_dn2, next_dn2: covariance of a row's mean with itself and the next row's, without what the
-    noise of its pixels makes, noise_dn2. white_dn, exposure_s: of the whiteboard, for a reading of
-    1, and its reference's; references, darks: frames of these.
-    """
-
-    own_dn2: float
-    next_dn2: float
-    noise_dn2: float
-    white_dn: tuple[float, float]
-    exposure_s: tuple[float, float]
-    references: int
-    darks: int
-
-
 @dataclass(frozen=True, eq=False)
 class Sample:
     """Pixels of a whiteboard, (n, 2), the colours they see, their readings and deviations, (n,)."""
@@ -180,9 +162,8 @@ class Board:
 
     reading, variance: (pixel_y, pixel_x); the variance of a pixel that is not to be used is
     infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all). repeats: frames
-    averaged. unsteady2: relative variance of the brightness between these, see `MeanFrame`. rows:
-    how rows err alike. loose: see `BoardFrame`. white2: (pixel_y, pixel_x), relative variance of
-    the reference, which the variance includes; whiteboards of one reference share the array.
+    averaged. unsteady2: relative variance of the brightness between these, see `MeanFrame`. loose:
+    see `BoardFrame`.
     """
 
     name: str
@@ -195,9 +176,7 @@ class Board:
     taken_s: float = 0.0
     repeats: int = 1
     unsteady2: float = 0.0
-    rows: Rows | None = None
     loose: bool = False
-    white2: NDArray[np.float32] | None = None
 
     @property
     def opening(self) -> Opening:
@@ -250,7 +229,7 @@ def as_readings(
     gain = gain_of(boards)
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
-    found, whites2 = [], dict[int, NDArray[np.float32]]()
+    found = []
     for board, taken in lit_boards(boards):
         reference = boards.reference(board.shot, board.lamp)
         if reference is None:
@@ -262,21 +241,7 @@ def as_readings(
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        if id(reference) not in whites2:
-            whites2[id(reference)] = _white2(reference, boards, gain)
-        white2 = whites2[id(reference)]
-        found.append(_board(board, taken, reference, boards, gain, layout, good, white2))
-    return found
-
-
-def _white2(reference: MeanFrame, boards: BoardSet, gain: SensorGain) -> NDArray[np.float32]:
-    """Return the relative variance of a reference, (pixel_y, pixel_x); 0 of dark pixels."""
-    dark = boards.dark_at(reference.exposure_s)
-    found = np.zeros(reference.mean_dn.shape, dtype=np.float32)
-    for rows in bands(found):
-        white, variance = signal_of(reference, dark, gain, rows)
-        enough = white * reference.exposure_s > DARKEST_REFERENCE_DN
-        found[rows] = np.where(enough, variance / np.where(enough, white, 1) ** 2, 0)
+        found.append(_board(board, taken, reference, boards, gain, layout, good))
     return found
 
 
@@ -331,20 +296,13 @@ def _board(
     gain: SensorGain,
     layout: PsiLayout,
     good: NDArray[np.bool_],
-    white2: NDArray[np.float32],
 ) -> Board:
     dark, dark_of_white = (boards.dark_at(each.exposure_s) for each in (frame, reference))
     reading, variance = (np.empty(good.shape, dtype=np.float32) for _ in range(2))
     bright = 0
     for rows in bands(reading):
-        signal, signal_variance = signal_of(frame, dark, gain, rows)
-        white, _ = signal_of(reference, dark_of_white, gain, rows)
-        enough = white * reference.exposure_s > DARKEST_REFERENCE_DN
+        reading[rows], spread, enough = ratio_of(frame, dark, reference, dark_of_white, gain, rows)
         bright += int(enough.sum())
-        safe = np.where(enough, white, 1)
-        ratio = signal / safe
-        spread = signal_variance / safe**2 + ratio**2 * white2[rows]
-        reading[rows] = ratio
         variance[rows] = np.where(enough & good[rows], spread, np.inf)
     if bright < 0.5 * reading.size:
         raise CalibrationError(
@@ -365,20 +323,8 @@ def _board(
         frame.taken_s,
         frame.count,
         frame.unsteady2(dark.mean_dn),
-        _rows(frame, reference, dark),
         board.loose,
-        white2,
     )
-
-
-def _rows(frame: MeanFrame, reference: MeanFrame, dark: MeanFrame) -> Rows:
-    noise_dn2 = dark.variance_dn2 / dark.mean_dn.shape[1]
-    own_dn2, next_dn2 = dark.rows_dn2
-    above = float(np.mean(reference.mean_dn - dark.mean_dn))
-    times_s = frame.exposure_s, reference.exposure_s
-    white_dn = above * times_s[0] / times_s[1], above
-    own_dn2 -= noise_dn2
-    return Rows(own_dn2, next_dn2, noise_dn2, white_dn, times_s, reference.count, dark.count)
 
 
 def unsteadiness2(boards: Sequence[Board], references: Sequence[tuple[int, float]] = ()) -> float:
@@ -400,6 +346,26 @@ def signal_of(
     of_dark = dark.variance_dn2 / dark.count + dark.extra_variance_dn2
     variance = own / frame.count + of_dark + frame.extra_variance_dn2
     return signal / frame.exposure_s, variance / frame.exposure_s**2
+
+
+def ratio_of(
+    frame: MeanFrame,
+    dark: MeanFrame,
+    reference: MeanFrame,
+    dark_of_reference: MeanFrame,
+    gain: SensorGain,
+    rows: slice,
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return readings of some rows, their variance, and where the reference is bright enough.
+
+    A reference that is not counts as just bright enough: hot or dead pixels, which no route uses.
+    """
+    signal, variance = signal_of(frame, dark, gain, rows)
+    white, white_variance = signal_of(reference, dark_of_reference, gain, rows)
+    enough = white * reference.exposure_s > DARKEST_REFERENCE_DN
+    white = np.maximum(white, DARKEST_REFERENCE_DN / reference.exposure_s)
+    ratio = signal / white
+    return ratio, (variance + ratio**2 * white_variance) / white**2, enough
 
 
 def channels_of(layout: PsiLayout, shot: int = 0) -> NDArray[np.uint8]:

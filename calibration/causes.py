@@ -197,7 +197,7 @@ def fit_plate(
     Least squares for the three, with the light that the aperture's edge cuts at every step.
     """
     few = np.array([through_pinhole(board) for board in boards])
-    turned = turned_by(plate_places_um(boards, geometry.cell_um))
+    turned = turned_by(boards, geometry.cell_um)
     far_um = max(float(np.abs(turned).max()), geometry.cell_um)
     by_plate = np.stack([np.tile([1.0, 0.0], (len(few), 1)), np.tile([0.0, 1.0], (len(few), 1)),
                          turned / far_um], axis=-1) * few[:, None, None]  # fmt: skip
@@ -232,7 +232,7 @@ def possible_causes(
     """
     count = len(boards)
     known, holes = holes is not None, np.zeros((count, 3)) if holes is None else holes
-    few = np.array([through_pinhole(board) for board in boards])
+    few, by_hand = _pinholes(boards)
     loose = np.array([board.loose for board in boards])
     moved = MOVED_STEPS * LEAST_MOVED_UM
     # Where pinholes stand off their holes, a lone open whiteboard is the only sure level.
@@ -257,7 +257,6 @@ def possible_causes(
         # Of larger and smaller holes the aperture's edge cuts the larger alone.
         slopes[:, :, :, 2] = np.diag(few)[:, None] * np.array([1, 0, 0, 0.5, 0.5])[:, None]
     by_place, by_area = np.split(slopes.reshape(count * OWN, count, 3), [2], axis=2)
-    by_hand = few & loose if loose.any() else few
     on_plate, least = moved / geometry.ratio, LEAST_MOVED_UM / geometry.ratio
     causes.append(Cause(HANDS, by_place[:, by_hand].reshape(count * OWN, -1), on_plate, least))
     if few.sum() > 1:
@@ -269,33 +268,39 @@ def possible_causes(
     common = few[:, None].astype(np.float64)
     causes.append(Cause(EXPOSURE, _own_columns(common, 0), BRIGHTNESSES))
     causes.append(Cause(PLATE, by_place.sum(axis=1), on_plate, least))
-    places_um = plate_places_um(boards, geometry.cell_um)
-    far_um = float(np.hypot(*places_um.T)[few].max())
+    turned = turned_by(boards, geometry.cell_um)
+    far_um = float(np.hypot(*turned.T)[few].max())
     if few.sum() > 1 and far_um > 0:
-        turned = np.einsum("obk,bk->o", by_place, turned_by(places_um))
-        causes.append(Cause(TURN, turned[:, None], on_plate / far_um, least / far_um))
+        columns = np.einsum("obk,bk->o", by_place, turned)[:, None]
+        causes.append(Cause(TURN, columns, on_plate / far_um, least / far_um))
     return causes
 
 
-def turned_by(places_um: Array) -> NDArray[np.float64]:
-    """Return by how much holes move, (board, 2), for each rad that the plate turns from x to y."""
-    return np.stack([-places_um[:, 1], places_um[:, 0]], axis=1)
+def _pinholes(boards: Sequence[Board]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return whether each whiteboard opens only some views, and whether its pinhole is hand-held.
+
+    If no whiteboard states a hand-held pinhole, every pinhole counts as hand-held.
+    """
+    few = np.array([through_pinhole(board) for board in boards])
+    loose = np.array([board.loose for board in boards])
+    return few, few & loose if loose.any() else few
 
 
-def plate_places_um(boards: Sequence[Board], cell_um: float) -> NDArray[np.float64]:
-    """Return where the middle of every whiteboard's open views lies, x and y: (board, 2)."""
+def turned_by(boards: Sequence[Board], cell_um: float) -> NDArray[np.float64]:
+    """Return by how much holes move, (board, 2), for each rad that the plate turns from x to y.
+
+    A hole lies in the middle of a whiteboard's open views.
+    """
     middles = np.array([np.argwhere(board.views_open).mean(axis=0) for board in boards])
     views = np.array(boards[0].views_open.shape)
-    return (middles - (views - 1) / 2)[:, ::-1] * cell_um
+    return (middles - (views - 1) / 2) * cell_um * [-1, 1]
 
 
 def pinholes_found(
     found: Sequence[FoundCause], boards: Sequence[Board], cell_um: float
 ) -> NDArray[np.float64]:
     """Return the pinholes by the causes found, (board, 3): see `Geometry.light`."""
-    few = np.array([through_pinhole(board) for board in boards])
-    loose = np.array([board.loose for board in boards])
-    by_hand = few & loose if loose.any() else few
+    few, by_hand = _pinholes(boards)
     holes = np.zeros((len(boards), 3))
     for cause in found:
         if cause.name == HANDS:
@@ -303,8 +308,7 @@ def pinholes_found(
         elif cause.name == PLATE:
             holes[few, :2] += cause.size
         elif cause.name == TURN:
-            turned = turned_by(plate_places_um(boards, cell_um))
-            holes[:, :2] += few[:, None] * cause.size[0] * turned
+            holes[:, :2] += few[:, None] * cause.size[0] * turned_by(boards, cell_um)
         elif cause.name in (HOLES, SIZE):
             holes[few, 2] += cause.size
     return holes

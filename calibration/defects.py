@@ -25,7 +25,6 @@ from numba import prange
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.ndimage import binary_dilation
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from emmc_rig.calibration.boards import Board, Opening
@@ -62,13 +61,9 @@ MOST_OF_SENSOR = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Defects:
-    """The mask with its defects: grains (row, column), the share each takes off, and the mask.
-
-    covariance: of the losses, (grain, grain) over the flat mask; sparse, since specks lie apart.
-    """
+    """The mask with its defects: grains (row, column), the share each takes off, and the mask."""
 
     lost: NDArray[np.float32]
-    covariance: sparse.csr_array
     mask: ShadowMask
 
     @property
@@ -251,8 +246,6 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
     evidence = _Evidence(np.zeros(size), np.zeros(size))
     evidence.add(shadow, _parts(boards), clean)
     chosen, seen, losses = np.zeros(0, np.int64), sparse.csr_array((len(clean), 0)), np.zeros(0)
-    count = evidence.gradient.size
-    covariance = sparse.csr_array((count, count))
     for _ in range(ROUNDS):
         changes = seen @ losses
         spread = max(1.0, deviation_of(clean + changes))
@@ -262,17 +255,17 @@ def find_defects(boards: Sequence[Board], mask: ShadowMask, placement: Placement
         more = (deviations > SUPPORT) & (evidence.curvature > (spread / SIZE) ** 2)
         more.ravel()[chosen] = False
         taken = len(chosen) + int(more.sum())
-        if taken == 0 or taken > LARGEST_SHARE * count:
+        if taken == 0 or taken > LARGEST_SHARE * evidence.gradient.size:
             break
         if more.any():
             new = _Chosen.of(more)
             rows = [_seen_grains(shadow, part, new) for part in _parts(boards)]
             seen = sparse.csr_array(sparse.hstack([seen, sparse.vstack(rows)]))
             chosen = np.concatenate([chosen, np.flatnonzero(more)])
-        losses, covariance = _solve_losses(seen, clean, chosen, count, spread)
+        losses = _solve_losses(seen, clean, spread)
     lost = np.zeros(size, np.float32)
     lost.ravel()[chosen] = losses
-    return Defects(lost, covariance, _with_losses(fine, placement, lost))
+    return Defects(lost, _with_losses(fine, placement, lost))
 
 
 def mask_with_losses(mask: ShadowMask, placement: Placement, lost: Array) -> ShadowMask:
@@ -331,49 +324,17 @@ def _seen_grains(shadow: Shadow, part: _Part, chosen: _Chosen) -> sparse.csr_arr
     return sparse.csr_array((values, (touched[rows], column[rows, entries])), shape=shape)
 
 
-def _solve_losses(
-    seen: sparse.csr_array, residual: Array, chosen: NDArray[np.intp], size: int, spread: float
-) -> tuple[NDArray[np.float64], sparse.csr_array]:
-    """Return the losses of the chosen grains, and their covariance on the flat mask.
+def _solve_losses(seen: sparse.csr_array, residual: Array, spread: float) -> NDArray[np.float64]:
+    """Return the losses of the chosen grains.
 
         (S^T S / spread^2 + 1 / SIZE^2) losses = - S^T residual / spread^2
 
-    seen: S. chosen: indices into the flat mask of `size` grains. residual: without losses.
+    seen: S. residual: without losses.
     """
-    prior = sparse.diags_array(np.full(len(chosen), 1 / SIZE**2))
+    prior = sparse.diags_array(np.full(seen.shape[1], 1 / SIZE**2))
     matrix = sparse.csc_array(seen.T @ seen / spread**2 + prior)
     solved = np.ravel(np.asarray(spsolve(matrix, -(seen.T @ residual) / spread**2)))
-    blocks, rows, columns = [], [], []
-    count, part_of = connected_components(matrix, directed=False)
-    for part in range(count):
-        grains = np.flatnonzero(part_of == part)
-        blocks.append(np.linalg.inv(matrix[grains][:, grains].toarray()).ravel())
-        rows.append(chosen[grains].repeat(len(grains)))
-        columns.append(np.tile(chosen[grains], len(grains)))
-    entries = np.concatenate(blocks), (np.concatenate(rows), np.concatenate(columns))
-    return np.clip(solved, -1, 1), sparse.csr_array(entries, shape=(size, size))
-
-
-def loss_variance(
-    defects: Defects,
-    mask: ShadowMask,
-    placement: Placement,
-    pixels: NDArray[np.int64],
-    channels: NDArray[np.uint8],
-    opening: Opening,
-) -> NDArray[np.float64]:
-    """Return what the losses' covariance makes of the variance of readings at pixels (n, 2).
-
-    mask: without the defects.
-    """
-    if len(pixels) == 0:
-        return np.zeros(0)
-    index, influence = _entries(Shadow(_grained(mask), placement), opening, pixels, channels)
-    rows = np.arange(len(pixels)).repeat(index.shape[1])
-    shape = (len(pixels), defects.lost.size)
-    slopes = sparse.csr_array((influence.ravel(), (rows, index.ravel())), shape=shape)
-    spread = sparse.csr_array(slopes @ defects.covariance)
-    return np.ravel(sparse.csr_array(spread.multiply(slopes)).sum(axis=1))
+    return np.clip(solved, -1, 1)
 
 
 def _with_losses(fine: ShadowMask, placement: Placement, lost: Array) -> ShadowMask:

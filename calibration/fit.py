@@ -24,7 +24,6 @@ Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -32,11 +31,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.linalg import solve_triangular
-from scipy.ndimage import correlate1d
 
-from emmc_rig.calibration.boards import Board, Opening, Rows, Sample, unsteadiness2
+from emmc_rig.calibration.boards import Board, Opening, Sample, unsteadiness2
 from emmc_rig.calibration.causes import (
     BLUR,
     CREEP,
@@ -109,9 +106,13 @@ from emmc_rig.calibration.shadow import (
 from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.pupil import Pupil
-from emmc_rig.model.settings import Settings
 
 Array = NDArray[np.floating]
+PIXELS, FIRST_PIXELS = 100_000, 12_000
+"""At most so many of all whiteboards together, alike of each, drawn at random over the window; and
+while the window widens. More make the placement surer than the mask is like its model."""
+MOST_STEPS, SMALLEST_STEP = 40, 0.02
+"""Steps of a fit, and the last one's size in standard deviations."""
 CHUNK = 4096
 """Pixels whose slopes by view are held at once: by 25 views 4 MB."""
 FIRST_WINDOW_PX = 64
@@ -154,10 +155,6 @@ LEAST_POWER, SURE_POWER = 5e-3, 10.0
 """Least difference of a response's power from 1, and how many deviations it must be."""
 MOSTLY = 0.4
 """Of the residuals beyond the noise: what explains less is imitated by another fault."""
-SURE_ROWS = 3.0
-"""Deviations from which on rows that err alike are no chance."""
-MOST_ALIKE, ROWS_ALIKE = 0.95, 64
-"""Correlation of neighbouring rows, and beyond how many it is 0."""
 SURE_MOVE = 5.0
 """Deviations of a whiteboard's own move from which on it is no chance."""
 KINDS = (0, 0, 1, 1, 2)
@@ -168,22 +165,6 @@ TAU_UM = 0.1
 """Beforehand tau is a half-t of 3 degrees of freedom and this scale (Gelman 2006, Bayesian Analysis
 1:515): there are too few views to determine it well. Uniform up to 1 um, whiteboards of nine views
 left a distance that was 12 % off undecided."""
-
-
-class FitSettings(Settings):
-    """Settings of the fit.
-
-    pixels: at most so many of all whiteboards together, alike of each, drawn at random over the
-    window; more make the placement surer than the mask is like its model.
-    """
-
-    pixels: int = Field(default=100_000, ge=500)
-    first_pixels: int = Field(default=12_000, ge=500, description="while the window widens")
-    max_steps: int = Field(default=40, ge=1)
-    tolerance: float = Field(
-        default=0.02, gt=0, description="of a last step, in standard deviations"
-    )
-    seed: int = Field(default=0, ge=0)
 
 
 @dataclass(frozen=True)
@@ -250,7 +231,6 @@ class Fit:
     outliers: float
     steps: int
     status: str
-    advice: str
     undecided: tuple[str, ...]
     more_boards: int
     boards: tuple[BoardCheck, ...]
@@ -563,8 +543,8 @@ def _descend(
     point: _Point,
     samples: Sequence[Sample],
     prior: _Prior,
-    settings: FitSettings,
     least_gain: float = LEAST_GAIN,
+    most_steps: int = MOST_STEPS,
 ) -> _Descent:
     """Return the point after Levenberg-Marquardt steps on these samples.
 
@@ -577,7 +557,7 @@ def _descend(
     least_gain.
     """
     damping = 1e-3
-    for step in range(settings.max_steps):
+    for step in range(most_steps):
         state, normal = point.state, point.normal
         pull = prior.pull(state)
         loss = point.loss(normal.spread, prior)
@@ -596,9 +576,9 @@ def _descend(
         size = float(np.max(np.abs(moved.vector() - state.vector()) / deviations))
         if trial_loss <= loss:
             point = trial
-        if size < settings.tolerance or loss - trial_loss < least_gain:
+        if size < SMALLEST_STEP or loss - trial_loss < least_gain:
             return _Descent(point, step + 1, True)
-    return _Descent(point, settings.max_steps, False)
+    return _Descent(point, most_steps, False)
 
 
 def _step_within_limits(state: _State, matrix: Array, gradient: Array) -> _State:
@@ -775,123 +755,6 @@ def _own_information(
     )
 
 
-class _RowErrors(NamedTuple):
-    """How rows of a frame err alike, as the darks' repeats show it."""
-
-    own_dn2: float
-    """Variance of a row's common error in one frame."""
-    alike: Array
-    """(2 reach + 1,), correlation of rows by their distance: share^|distance|."""
-    darks: float
-    """Frames of the dark."""
-
-
-def _row_errors(known: Sequence[Rows], height: int) -> _RowErrors | None:
-    """Return how rows err alike; None where no more than chance is seen."""
-    own_dn2, next_dn2, noise_dn2, darks = (
-        float(np.mean([getattr(rows, name) for rows in known]))
-        for name in ("own_dn2", "next_dn2", "noise_dn2", "darks")
-    )
-    if not own_dn2 > SURE_ROWS * noise_dn2 * np.sqrt(2 / (height * max(darks - 1, 1))):
-        return None
-    reach = min(ROWS_ALIKE, height - 1)
-    share = float(np.clip(next_dn2 / own_dn2, 0.0, MOST_ALIKE))
-    return _RowErrors(own_dn2, share ** np.abs(np.arange(-reach, reach + 1)), darks)
-
-
-def _rows_covariance(
-    point: _Point, samples: Sequence[Sample], covariance: Array
-) -> NDArray[np.float64]:
-    """Return what rows that err alike add to the covariance C.
-
-    A row's error is its neighbour's to a share (autoregressive): covariance own_dn2 A of the rows,
-    A_kl = share^|k - l|. An error e (row,) of a frame moves the parameters by C G^T e, with
-
-        G (row, parameter) = sum of w J / (deviation spread)^2 over the row's pixels, by a DN
-        added = own_dn2 C (sum over frames of G^T A G / repeats) C
-
-    Each whiteboard has errors of its own; those of the references and of the darks are in all
-    whiteboards, so that their G are summed first. What whole frames of light do alike is counted
-    beside: the mean over the rows is taken out.
-    """
-    size, height = len(covariance), len(samples[0].board.reading)
-    known = [rows for sample in samples if (rows := sample.board.rows) is not None]
-    errors = _row_errors(known, height) if len(known) == len(samples) else None
-    if errors is None:
-        return np.zeros((size, size))
-
-    def squared(by_row: Array) -> NDArray[np.float64]:
-        product = by_row.T @ correlate1d(by_row, errors.alike, axis=0, mode="constant")
-        return np.asarray(product, np.float64)
-
-    def apart(by_row: Array) -> Array:
-        return by_row - by_row.mean(axis=0)
-
-    state, spread = point.state, point.normal.spread
-    added, of_references = np.zeros((size, size)), np.zeros((height, size))
-    of_darks: dict[float, Array] = defaultdict(lambda: np.zeros((height, size)))
-    for index, (residual, slope) in enumerate(point.linear):
-        sample, rows = samples[index], known[index]
-        # By an error of the whiteboard, and of its reference: a reading is their ratio.
-        by_row, read_by_row = np.zeros((height, size)), np.zeros((height, size))
-        weight = tukey_weights(residual / spread) / (sample.deviation * spread**2)
-        pull, where = slope * weight[:, None], (sample.pixels[:, :1], state.places(index))
-        np.add.at(by_row, where, pull)
-        np.add.at(read_by_row, where, pull * point.linear[index].read(sample)[:, None])
-        white_dn, reference_dn = rows.white_dn
-        by_row, read_by_row = by_row / white_dn, read_by_row / reference_dn
-        added += squared(apart(by_row)) / sample.board.repeats
-        of_references += apart(read_by_row) / np.sqrt(rows.references)
-        exposure_s, reference_exposure_s = rows.exposure_s
-        of_darks[exposure_s] += by_row
-        of_darks[reference_exposure_s] -= read_by_row
-    added += squared(of_references)
-    for by_row in of_darks.values():
-        added += squared(by_row) / errors.darks
-    return np.asarray(errors.own_dn2 * covariance @ added @ covariance, np.float64)
-
-
-def _references_covariance(
-    point: _Point, samples: Sequence[Sample], covariance: Array
-) -> NDArray[np.float64]:
-    """Return what it adds to the covariance C that whiteboards share the noise of a reference.
-
-    A reference's pixel that is brighter by e makes every reading r of the pixel r e darker. With
-    g = w J r / (deviation spread^2) of a whiteboard's reading, and all g of a pixel summed first,
-
-        added = C (sum over pixels of var e ((sum g) (sum g)^T - sum g g^T)) C
-
-    The second is counted in C, as if every whiteboard had a reference of its own.
-    """
-    size, spread = len(covariance), point.normal.spread
-    added = np.zeros((size, size))
-    of_reference = defaultdict[int, list[int]](list)
-    for index, sample in enumerate(samples):
-        if sample.board.white2 is not None:
-            of_reference[id(sample.board.white2)].append(index)
-    for indices in of_reference.values():
-        white2 = samples[indices[0]].board.white2
-        assert white2 is not None
-        flat = [np.ravel_multi_index(tuple(samples[i].pixels.T), white2.shape) for i in indices]
-        drawn = np.unique(np.concatenate(flat))
-        for first in range(0, len(drawn), CHUNK):
-            pixels = drawn[first : first + CHUNK]
-            summed = np.zeros((len(pixels), size))
-            deviation = np.sqrt(white2.ravel()[pixels].astype(np.float64))
-            for index, of_board in zip(indices, flat, strict=True):
-                # Drawn pixels are in order.
-                part = slice(*np.searchsorted(of_board, [pixels[0], pixels[-1] + 1]))
-                at = np.searchsorted(pixels, of_board[part])
-                residual, slope = point.linear[index]
-                pull = tukey_weights(residual[part] / spread) / spread**2 * deviation[at]
-                pull *= slope[part, -OWN]
-                alone, places = slope[part] * pull[:, None], point.state.places(index)
-                summed[np.ix_(at, places)] += alone
-                added[np.ix_(places, places)] -= alone.T @ alone
-            added += summed.T @ summed
-    return np.asarray(covariance @ added @ covariance, np.float64)
-
-
 def settled(fit: Fit, boards: Sequence[Board], mask: ShadowMask) -> list[Board]:
     """Return the whiteboards with the effects of the causes taken out.
 
@@ -920,7 +783,6 @@ def fit_placement(
     boards: Sequence[Board],
     camera: Camera,
     mask: ShadowMask,
-    settings: FitSettings | None = None,
     start: Placement | Fit | None = None,
 ) -> Fit:
     """Return the placement that explains the whiteboards.
@@ -930,16 +792,15 @@ def fit_placement(
     for a mask that is not the design's (with the correlation found), and where the fit does not
     explain what it was given. Not converging is a status.
     """
-    settings = settings or FitSettings()
     if not boards:
         raise CalibrationError("no whiteboard with the mask in: capture at least one")
     ratio, steps = mask.distance_um / mask.lens_um, 0
-    whole = _drawn(boards, np.inf, settings.pixels, np.random.default_rng(settings.seed))
+    whole = _drawn(boards, np.inf, PIXELS, np.random.default_rng(0))
     if isinstance(start, Fit):
         state, windows = _State(start.placement, start.own), [whole]
     else:
         state = _State(start or _registered(boards, camera, mask), np.zeros((len(boards), OWN)))
-        windows = [*_widening_samples(boards, mask, settings), whole]
+        windows = [*_widening_samples(boards, mask), whole]
     bench = _bench_prior(boards, camera, mask, state.placement)
     widths = bench.first_widths(ratio)
     prior = bench.with_widths(widths)
@@ -947,20 +808,19 @@ def fit_placement(
         point = _point(mask, state, samples)
         if steps == 0 and not isinstance(start, Fit) and state.placement.pupil is None:
             # A pupil that is not known leads the fit astray: it is looked for after a few steps.
-            few = settings.model_copy(update={"max_steps": STEPS_TO_PUPIL})
-            point = _descend(mask, point, samples, prior, few, FIRST_GAIN).point
+            point = _descend(mask, point, samples, prior, FIRST_GAIN, STEPS_TO_PUPIL).point
             seen = likeliest_pupil(_view_light(mask, point, prior), mask)
-            point = _likelier(mask, point, samples, prior, settings, seen)
+            point = _likelier(mask, point, samples, prior, seen)
             bench = _bench_prior(boards, camera, mask, point.state.placement)
             prior = bench.with_widths(widths)
-        descent = _descend(mask, point, samples, prior, settings, FIRST_GAIN)
+        descent = _descend(mask, point, samples, prior, FIRST_GAIN)
         state, steps = descent.point.state, steps + descent.steps
     pupil = descent.point.state.placement.pupil
     if not isinstance(start, Fit) and (pupil is None or pupil.rim is None):
         growth = _light_growth(mask, descent.point, whole, prior)
         light = _view_light(mask, descent.point, prior)
         seen = likeliest_rim(light, growth, mask, descent.point.state.placement.fitted_pupil())
-        point = _likelier(mask, descent.point, whole, prior, settings, seen)
+        point = _likelier(mask, descent.point, whole, prior, seen)
         if point is not descent.point:
             # The rim as fitted decides how many knots there are.
             at = point.state.placement
@@ -969,7 +829,7 @@ def fit_placement(
             point = _point(mask, replace(point.state, placement=at), whole)
             bench = _bench_prior(boards, camera, mask, point.state.placement)
             prior = bench.with_widths(widths)
-            descent = _descend(mask, point, whole, prior, settings, FIRST_GAIN)
+            descent = _descend(mask, point, whole, prior, FIRST_GAIN)
             steps += descent.steps
     found, off_plate, unlike = list[FoundCause](), False, False
     for turn, least_gain in enumerate(CAUSE_GAINS):
@@ -985,7 +845,7 @@ def fit_placement(
         aberrant = any(cause.name == LENS for cause in found)
         softened = bench.softened(found, descent.point.state.placement)
         prior = softened.with_widths(_own_widths(found, ratio), aberrant)
-        descent = _descend(mask, descent.point, whole, prior, settings, least_gain)
+        descent = _descend(mask, descent.point, whole, prior, least_gain)
         steps += descent.steps
         off_plate = any(cause.name in OF_PLATE for cause in found)
         unlike = off_plate or any(
@@ -1021,7 +881,6 @@ def fit_placement(
         outliers=1 - normal.kept / max(normal.count, 1),
         steps=steps,
         status="converged" if descent.converged else "step limit reached",
-        advice="" if descent.converged else "raise max_steps, or capture another whiteboard",
         undecided=undecided,
         more_boards=more,
         boards=checks,
@@ -1057,7 +916,6 @@ def _likelier(
     point: _Point,
     samples: Sequence[Sample],
     prior: _Prior,
-    settings: FitSettings,
     pupil: Pupil | None,
 ) -> _Point:
     """Return the point fitted behind another pupil where it is clearly likelier, else the point.
@@ -1075,7 +933,7 @@ def _likelier(
     for part in (PUPIL, RIM) if pupil.rim else (PUPIL,):
         precision[part, part] = np.diag(1 / deviations[part] ** 2)
     freed = _Prior(precision, prior.centre)
-    other = _descend(mask, _point(mask, start, samples), samples, freed, settings, FIRST_GAIN).point
+    other = _descend(mask, _point(mask, start, samples), samples, freed, FIRST_GAIN).point
     likelier = point.loss(point.normal.spread, prior) - other.loss(point.normal.spread, freed)
     return other if likelier > CLEARLY_ROUND else point
 
@@ -1131,16 +989,14 @@ def _drawn(
     return [board.sampled(half_px, each, rng) for board in boards]
 
 
-def _widening_samples(
-    boards: Sequence[Board], mask: ShadowMask, settings: FitSettings
-) -> Iterator[list[Sample]]:
-    """Yield samples of `first_pixels` from windows that widen to the picture."""
-    rng = np.random.default_rng(settings.seed)
+def _widening_samples(boards: Sequence[Board], mask: ShadowMask) -> Iterator[list[Sample]]:
+    """Yield samples of FIRST_PIXELS from windows that widen to the picture."""
+    rng = np.random.default_rng(0)
     whole_px, half_px = max(mask.pixel_shape()) / 2, float(FIRST_WINDOW_PX)
     while half_px < whole_px:
-        yield _drawn(boards, half_px, settings.first_pixels, rng)
+        yield _drawn(boards, half_px, FIRST_PIXELS, rng)
         half_px *= 2
-    yield _drawn(boards, whole_px, settings.first_pixels, rng)
+    yield _drawn(boards, whole_px, FIRST_PIXELS, rng)
 
 
 def _covariance(
@@ -1148,15 +1004,12 @@ def _covariance(
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Return the covariance of all parameters, and the variances of the views' own, see `Fit`.
 
-    C = (matrix + P)^-1 of all parameters, and what the views' own, rows that err alike and the
-    noise of references add.
+    C = (matrix + P)^-1 of all parameters, and what the views' own add.
     """
     information = point.normal.matrix + prior.precision
     covariance = np.asarray(np.linalg.inv(information), np.float64)
     of_views, astray2 = _bias_covariance(covariance, _view_terms(mask, point, samples))
-    of_rows = _rows_covariance(point, samples, covariance)
-    of_references = _references_covariance(point, samples, covariance)
-    return covariance + of_views + of_rows + of_references, astray2
+    return covariance + of_views, astray2
 
 
 def _fit_power(point: _Point, samples: Sequence[Sample], covariance: Array) -> Power:

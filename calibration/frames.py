@@ -45,9 +45,9 @@ class MeanFrame:
     mean_dn: (y, x) float32. variance_dn2: variance of one frame, averaged over the pixels, from
     the spread between repeats; NaN with one frame. taken_s: when, on any clock of the capture.
     extra_variance_dn2: of the mean, by the errors of frames that were subtracted from it.
-    level_variance_dn2: of a frame's mean between repeats. rows_dn2: covariance of a row's mean
-    between repeats with itself and with the next row's: lamp and shutter change whole rows alike,
-    which is no noise of single pixels. step_dn: between the values that the frames use.
+    level_variance_dn2: of a frame's mean between repeats. rows_dn2: of a row's mean between them:
+    lamp and shutter change whole rows alike, which is no noise of single pixels. step_dn: between
+    the values that the frames use.
     """
 
     mean_dn: NDArray[np.float32]
@@ -57,7 +57,7 @@ class MeanFrame:
     taken_s: float = 0.0
     extra_variance_dn2: float = 0.0
     level_variance_dn2: float = 0.0
-    rows_dn2: tuple[float, float] = (0.0, 0.0)
+    rows_dn2: float = 0.0
     step_dn: float = 1.0
 
     def noise_dn2(self, dark_dn: NDArray[np.floating] | float) -> float:
@@ -80,11 +80,11 @@ class MeanFrame:
 
     def _of_rows(self, dark_dn: NDArray[np.floating] | float) -> NDArray[np.float64]:
         """Return the variance of pixels by what their rows do alike, (y,)."""
-        if not any(self.rows_dn2):
+        if not self.rows_dn2:
             return np.zeros(len(self.mean_dn))
         light = (self.mean_dn - dark_dn).astype(np.float64)
         mean, columns = light.mean(axis=1), light.shape[1]
-        alike = len(mean) * (self.rows_dn2[0] - self.variance_dn2 / columns)
+        alike = len(mean) * (self.rows_dn2 - self.variance_dn2 / columns)
         # A pixel that is brighter than others changes by more. Rows that see no light, as under a
         # lamp of another colour, tell nothing.
         relative = alike / max(float(np.sum(np.square(mean))), 1e-12)
@@ -132,17 +132,17 @@ def average(
         levels.append(float(rows[-1].mean()))
     if total is None:
         raise CalibrationError(f"{what}: no frame was taken")
-    spread, of_levels, lags = np.nan, 0.0, (0.0, 0.0)
+    spread, of_levels, of_rows = np.nan, 0.0, 0.0
     if count > 1:
         of_levels = float(np.var(levels, ddof=1))
-        lags = _lags(np.array(rows) - np.mean(rows, axis=0), 1 - 1 / count)
+        of_rows = float(np.mean(np.var(rows, axis=0, ddof=1)))
         spread = (squares - _sum_of_squares(total) / count) / total.size / (count - 1)
         _check_steady(levels, float(np.sqrt(spread / total.size)), what, lit)
         if lit:
             _check_rows(np.array(rows), spread / total.shape[1], what)
     mean = (total / count).astype(np.float32)
     step_dn = 1.0 if np.isnan(step_dn) else step_dn
-    return MeanFrame(mean, spread, count, exposure_s, taken_s, 0.0, of_levels, lags, step_dn)
+    return MeanFrame(mean, spread, count, exposure_s, taken_s, 0.0, of_levels, of_rows, step_dn)
 
 
 def step_of_values(frames: Iterable[NDArray[np.uint16]]) -> float:
@@ -169,12 +169,6 @@ def step_of_values(frames: Iterable[NDArray[np.uint16]]) -> float:
     if weights[gaps == usual].sum() > USUAL_SHARE * weights[near].sum():
         return float(usual)
     return float(np.average(gaps[near], weights=weights[near]))
-
-
-def _lags(apart: NDArray[np.float64], freedom: float) -> tuple[float, float]:
-    """Return the covariance of rows (repeat, y) with themselves and the next ones."""
-    next_ones = float(np.mean(apart[:, 1:] * apart[:, :-1])) if apart.shape[1] > 1 else 0.0
-    return float(np.mean(np.square(apart))) / freedom, next_ones / freedom
 
 
 def bands(frame: Frame) -> list[slice]:
@@ -208,9 +202,7 @@ def before_and_after(before: MeanFrame, after: MeanFrame) -> MeanFrame:
         before.exposure_s,
         (before.taken_s + after.taken_s) / 2,
         change**2 / 12,
-        rows_dn2=_lags(
-            (difference - change).mean(axis=1)[None], 1 / before.count + 1 / after.count
-        ),
+        rows_dn2=float(np.var(difference.mean(axis=1))) / (1 / before.count + 1 / after.count),
         step_dn=max(before.step_dn, after.step_dn),
     )
 
@@ -245,10 +237,10 @@ def dark_at(darks: Sequence[MeanFrame], exposure_s: float) -> MeanFrame:
     count = min(dark.count for _, dark in used)
     extra = max(noise - spread / count, 0.0)
     mean_dn = np.asarray(mean, dtype=np.float32)
-    own, following = (sum(share * dark.rows_dn2[lag] for share, dark in used) for lag in (0, 1))
+    of_rows = sum(share * dark.rows_dn2 for share, dark in used)
     step_dn = max(dark.step_dn for _, dark in used)
     return MeanFrame(
-        mean_dn, spread, count, exposure_s, 0.0, extra, rows_dn2=(own, following), step_dn=step_dn
+        mean_dn, spread, count, exposure_s, 0.0, extra, rows_dn2=of_rows, step_dn=step_dn
     )
 
 

@@ -6,10 +6,10 @@ anywhere. So the misfit's variance is taken as level + per_slope x slope^2, by v
 squares that noise does not explain (variance components; medians of like slopes keep specks out).
 
 Of a coefficient that the pinhole measured as well there are two estimates. The misfit is what the
-two differ by beyond their deviations, over what lies in a view alike close to the mask's edges, and
-around a pixel (empirical Bayes: Efron 2010, chapter 1); with both weighed
-by their variances, Psi is the model's where the misfit is small, and the pinhole's where it is
-large (dust, a bent mask, glass).
+two differ by beyond their deviations, over what lies in a view alike close to the mask's edges
+(empirical Bayes: Efron 2010, chapter 1). With both weighed by their variances, Psi is the model's
+where the misfit is small, and the pinhole's where it is large (a bent mask, glass) or where the two
+lie far apart (dust).
 """
 
 from __future__ import annotations
@@ -19,15 +19,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from emmc_rig.calibration.whiteboard import Calibration
 
 Array = NDArray[np.floating]
 LIKE_SLOPES = 6
 """Groups of coefficients alike in slope, of as many pixels each."""
-AROUND_PX = 7
-"""Side of a pixel's surroundings, over which the misfit is averaged."""
 SURE = 3.0
 """Standard deviations, from which on an excess over the noise is no chance."""
 TILE = 2
@@ -114,7 +111,7 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
         weight = expected + share (measured - expected),    variance = share noise
 
     expected, inherent: the model's coefficient and variance; measured, noise: the pinhole's; misfit
-    as measured over the view and around the pixel. An outlier is the pinhole's alone (share 1).
+    as measured over the view. An outlier is the pinhole's alone (share 1).
     good: (pixel_y, pixel_x), pixels whose frames count; elsewhere Psi is the model's.
     """
     weights, deviation = np.empty_like(free.psi.weights), np.empty_like(free.psi.weights)
@@ -141,7 +138,7 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
     for place, view in zip(places, beyond_chance(views), strict=True):
         measured, expected, noise, inherent = estimates_of(place)
         squares = (measured - expected) ** 2
-        misfit = _local_misfit(squares, noise + inherent, view.variance(expected), usable)
+        misfit = view.variance(expected)
         share = (inherent + misfit) / (inherent + misfit + noise)
         share = np.where(squares > OUTLIER2 * (noise + inherent + misfit), 1.0, share)
         share = np.where(usable, share, 0.0)
@@ -149,18 +146,3 @@ def combined(free: Calibration, model: Calibration, good: NDArray[np.bool_]) -> 
         variance = np.where(usable, share * noise, inherent + misfit)
         deviation[place] = np.sqrt(variance)
     return replace(free, psi=replace(free.psi, weights=weights), deviation=deviation, good=good)
-
-
-def _local_misfit(
-    squares: Array, variance: Array, misfit: Array, usable: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Return the misfit's variance (y, x): of a pixel's surroundings where that surely differs.
-
-    There it is the mean of squares - variance over AROUND_PX x AROUND_PX usable pixels, which
-    chance makes uncertain by sqrt(2) / AROUND_PX of the variance.
-    """
-    over = np.where(usable, squares - variance - misfit, 0.0)
-    inside = uniform_filter(usable.astype(np.float64), AROUND_PX)
-    more = uniform_filter(over, AROUND_PX) / np.maximum(inside, 1e-9)
-    deviation = np.sqrt(2.0) / AROUND_PX * (variance + misfit)
-    return np.where(np.abs(more) > SURE * deviation, np.maximum(misfit + more, 0.0), misfit)

@@ -28,15 +28,13 @@ SAMPLED = 3_000
 class Parametric:
     """What the parametric routes know of the bench: fit and mask, with its defects if sought.
 
-    misfit: of the model at whiteboards of few views, by view; None without any. of_defects: mean
-    square of the error where the mask has defects, over the square of the light they take.
+    misfit: of the model at whiteboards of few views, by view; None without any.
     """
 
     fit: Fit
     mask: ShadowMask
     defects: Defects | None = None
     misfit: Mapping[tuple[int, int], Misfit] | None = None
-    of_defects: float = 0.0
 
     @property
     def shadow(self) -> Shadow:

@@ -121,8 +121,7 @@ class Placement:
         for name, (least, most) in LIMITS.items():
             scalars[name] = min(max(scalars[name], least), most)
         weights = np.maximum(vector[len(SCALARS) :], 1e-3).reshape(np.shape(self.aperture))
-        rows = tuple(tuple(map(float, row)) for row in weights)
-        return Placement(**scalars, aperture=rows, pupil=self.pupil)
+        return Placement(**scalars, aperture=as_weights(weights), pupil=self.pupil)
 
     def fitted_pupil(self) -> Pupil | None:
         """Return the pupil with centre, diameter and rim of these parameters."""
@@ -195,8 +194,12 @@ class Tolerances:
         return np.array([*scalars, *[self.aperture] * (views[0] * views[1])])
 
 
+def as_weights(values: NDArray[np.floating]) -> tuple[tuple[float, ...], ...]:
+    """Return an array (v, u) as the aperture's weights of a placement."""
+    return tuple(tuple(map(float, row)) for row in values)
+
+
 def with_aperture_mean_one(placement: Placement) -> Placement:
     """Return the same Psi with aperture weights of mean 1: only their ratios count."""
     weights = np.array(placement.aperture)
-    weights /= weights.mean()
-    return replace(placement, aperture=tuple(tuple(map(float, row)) for row in weights))
+    return replace(placement, aperture=as_weights(weights / weights.mean()))

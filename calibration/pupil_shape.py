@@ -21,6 +21,7 @@ to the log evidence.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,8 @@ SURE_GROWTH = 8.0
 """Deviations of chi^2 from which on light that grows over the picture is looked at."""
 MOVES = np.geomspace(0.005, 0.3, 7)
 """Of a rim, tried from the middle of the picture to its corner, of the longer side of all views."""
+FIRST_STEP = 0.02
+"""Of the simplex, of that side."""
 WIDE = 1.5
 """Diameter of a pupil that cuts no view, of that side."""
 LEAST_SEEN = 1e-3
@@ -136,18 +139,12 @@ def likeliest_pupil(seen: ViewLight, mask: ShadowMask) -> Pupil | None:
         x_mm, y_mm, share = (float(value) for value in values * side_mm)
         return Pupil(diameter_mm=max(share, 1e-3), centre_mm=(x_mm, y_mm))
 
-    from scipy.optimize import minimize
+    def evidence(values: Array) -> float:
+        return _evidence(seen, mask, pupil_of(values))[0]
 
-    best = max(tried, key=lambda side: tried[side])
-    start = np.array([0.0, 0.0, best])
-    simplex = start + np.vstack([np.zeros(3), np.diag([0.02, 0.02, 0.02])])
-    found = minimize(
-        lambda values: -_evidence(seen, mask, pupil_of(values))[0],
-        start,
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 5e-4, "fatol": 0.1, "maxiter": 150},
-    )
-    return pupil_of(found.x) if -found.fun > even + CLEARLY_ROUND else None
+    start = np.array([0.0, 0.0, max(tried, key=lambda side: tried[side])])
+    found, reached = _highest(evidence, start, np.full(3, FIRST_STEP), 150)
+    return pupil_of(found) if reached > even + CLEARLY_ROUND else None
 
 
 def likeliest_rim(
@@ -186,24 +183,24 @@ def likeliest_rim(
         for rim in SIDES
         for move in (*MOVES, *-MOVES)
     ]
+    best = max(starts, key=evidence)
+    found, reached = _highest(evidence, best, np.array([*[FIRST_STEP] * 4, 0.2 * best[-1]]), 300)
+    return pupil_of(found) if reached > _evidence(seen, mask, pupil)[0] + CLEARLY_ROUND else None
+
+
+def _highest(
+    evidence: Callable[[Array], float], start: Array, steps: Array, most: int
+) -> tuple[Array, float]:
+    """Return where the evidence is highest about a start, by the simplex, and the evidence there.
+
+    steps: of the first simplex. most: iterations.
+    """
     from scipy.optimize import minimize
 
-    best = max(starts, key=evidence)
-    sides = np.diag([0.02, 0.02, 0.02, 0.02, 0.2 * best[-1]])
-    found = minimize(
-        lambda values: -evidence(values),
-        best,
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": best + np.vstack([np.zeros(5), sides]),
-            "xatol": 5e-4,
-            "fatol": 0.1,
-            "maxiter": 300,
-        },
-    )
-    return (
-        pupil_of(found.x) if -found.fun > _evidence(seen, mask, pupil)[0] + CLEARLY_ROUND else None
-    )
+    simplex = start + np.vstack([np.zeros(len(start)), np.diag(steps)])
+    options = {"initial_simplex": simplex, "xatol": 5e-4, "fatol": 0.1, "maxiter": most}
+    found = minimize(lambda values: -evidence(values), start, method="Nelder-Mead", options=options)
+    return found.x, -found.fun
 
 
 def _opened(

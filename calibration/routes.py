@@ -41,7 +41,7 @@ from emmc_rig.calibration.colours import (
     mixing,
     other_colours,
 )
-from emmc_rig.calibration.defects import find_defects, loss_variance, moved_dust
+from emmc_rig.calibration.defects import find_defects, moved_dust
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.fit import OFFSETS, SIDES, Fit, fit_placement, settled
 from emmc_rig.calibration.frames import MeanFrame
@@ -50,12 +50,10 @@ from emmc_rig.calibration.glare import Glare, measure_glare
 from emmc_rig.calibration.levels import Levels, fit_levels
 from emmc_rig.calibration.locator import SOFT_EDGES
 from emmc_rig.calibration.misfit import Misfit, beyond_chance, combined, measured_misfit
-from emmc_rig.calibration.openings import views_open
 from emmc_rig.calibration.parametric import (
     Parametric,
     Stages,
     coefficient_plane,
-    coefficient_planes,
     of_samples,
     psi_deviation,
     shot_stages,
@@ -75,8 +73,6 @@ from emmc_rig.model.blas import one_blas_thread
 from emmc_rig.model.camera import Camera
 from emmc_rig.model.sensing import PsiLayout
 
-LEAST_LOSS = 1e-5
-"""Of a reading, where a defect is in it."""
 GLARE_ROUNDS = 2
 """Fits without the glare, which is then measured again: what is left of 1 % is linear to 1e-4."""
 REGISTERED_MISS = 3.0
@@ -420,9 +416,7 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
         mixed = _fit_with_defects(readings.seen, task.camera, models["parametric"])
         models["mixed"] = with_misfit(mixed, seen)
     bare, psis = {}, {}
-    for name, fitted in models.items():
-        missed = _missed_at_defects(fitted, [*seen, *readings.judges])
-        model = replace(fitted, of_defects=missed)
+    for name, model in models.items():
         task.on_stage(f"Psi, {name}")
         bare[name] = _calibration_by(model, task, few, readings.good)
         if glare is not None:
@@ -510,8 +504,6 @@ def _calibration_by(
     astray2 = model.fit.astray2 if model.misfit is None else ()
     covariance = model.fit.covariance
     deviation = psi_deviation(model.shadow, layout, task.stages, covariance, astray2)
-    if model.defects is not None and model.defects.count:
-        deviation = _with_defect_variance(deviation, model, layout, task.stages)
     white = np.stack([_white_dn_per_s(boards, layout, shot) for shot in range(layout.shots)])
     return Calibration(psi, deviation, boards.dark.mean_dn, white, gain_of(boards), good)
 
@@ -715,30 +707,6 @@ def with_misfit(model: Parametric, seen: Sequence[Board]) -> Parametric:
     )
 
 
-def _missed_at_defects(model: Parametric, boards: Sequence[Board]) -> float:
-    """Return the mean square that whiteboards miss at defects, over that of what defects take.
-
-    Half cells do not draw the outline of a speck. Give it those held out as well: to those fitted
-    the losses of the grains are fitted too.
-    """
-    if model.defects is None or model.defects.count == 0:
-        return 0.0
-    clean, soiled = Shadow(model.mask, model.fit.placement), model.shadow
-    missed = taken = 0.0
-    for board in boards:
-        predicted = predicted_by_shadow(soiled, board)
-        lost = np.abs(predicted - predicted_by_shadow(clean, board)) > LEAST_LOSS
-        excess = np.square(board.reading - predicted, dtype=np.float64) - board.variance
-        there, elsewhere = (board.usable & chosen for chosen in (lost, ~lost))
-        if not there.any() or not elsewhere.any():
-            continue
-        missed += float(excess[there].sum() - there.sum() * excess[elsewhere].mean())
-        where = np.argwhere(there), board.channels[there], board.stage_um, board.shot
-        of_views = clean.coefficients(*where) - soiled.coefficients(*where)
-        taken += float(np.square(of_views[:, board.views_open]).sum())
-    return max(missed / taken, 0.0) if taken > 0 else 0.0
-
-
 def _judged_model(
     name: str, model: Parametric, judges: Sequence[Board], seen: Sequence[Board]
 ) -> HeldOut:
@@ -799,31 +767,6 @@ def _correct_pinholes(
             variance += np.square(unsure * right)
             variance += np.tensordot(np.square(deviations[SIDES]), np.square(by_sides), 1)
             deviation[index] = np.sqrt(deviation[index] ** 2 + variance)
-
-
-def _with_defect_variance(
-    deviation: NDArray[np.float32], model: Parametric, layout: PsiLayout, stages: Stages
-) -> NDArray[np.float32]:
-    """Return the deviation of Psi with what is not known of the defects of its mask."""
-    assert model.defects is not None
-    clean, soiled = (
-        coefficient_planes(Shadow(mask, model.fit.placement), layout, stages)
-        for mask in (model.mask, model.defects.mask)
-    )
-    for ((shot, v, u, stored), bare), (_, plane) in zip(clean, soiled, strict=True):
-        touched = np.argwhere(bare != plane)
-        y, x = touched.T
-        opened = views_open(model.mask.views, (v, u))
-        channels = np.full(len(touched), stored, dtype=np.uint8)
-        if layout.colour is not None:
-            channels = layout.colour[shot, y, x]
-        how = touched, channels, (opened, stages[shot], shot)
-        of_losses = loss_variance(model.defects, model.mask, model.fit.placement, *how)
-        of_outline = model.of_defects * np.square(bare - plane)[y, x]
-        place = (shot, v, u, y, stored, x)
-        more = of_losses / deviation.shape[4] ** 2 + of_outline
-        deviation[place] = np.sqrt(np.square(deviation[place]) + more)
-    return deviation
 
 
 def _with_misfit_variance(known: Calibration, model: Parametric) -> Calibration:

@@ -172,14 +172,13 @@ def amplified(dark: MeanFrame, factor: float, black_dn: NDArray[np.floating]) ->
     rows, columns = dark.mean_dn.shape
     down, across = -(-rows // black_dn.shape[0]), -(-columns // black_dn.shape[1])
     black = np.tile(black_dn, (down, across))[:rows, :columns]
-    own_dn2, next_dn2 = dark.rows_dn2
     return replace(
         dark,
         mean_dn=(black + factor * (dark.mean_dn - black)).astype(np.float32),
         variance_dn2=dark.variance_dn2 * factor**2,
         extra_variance_dn2=dark.extra_variance_dn2 * factor**2,
         level_variance_dn2=dark.level_variance_dn2 * factor**2,
-        rows_dn2=(own_dn2 * factor**2, next_dn2 * factor**2),
+        rows_dn2=dark.rows_dn2 * factor**2,
     )
 
 

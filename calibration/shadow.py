@@ -831,14 +831,6 @@ def _find_footprints(pixels, cells, tables, turns, rays, boxes, weights, out):
             light_shares[n, k] = weight * light.leaning * light.falling / total
 
 
-class _Drawn(NamedTuple):
-    """What the kernel draws: see `share_tables`."""
-
-    tables: NDArray[np.float64]
-    boxes: _Boxes
-    weights: _Weights
-
-
 @dataclass(eq=False)
 class _Part:
     """The pixels about a knot, and the openings that they see; of a lens without a rim, all."""
@@ -975,8 +967,8 @@ class Shadow:
             slopes = self.with_slopes(pixels, channels, views_open, stage_um, frame)[1]
         return sized.readings + by_sides @ wider, slopes, by_sides
 
-    def _sized(self, part: _Part, sides: NDArray[np.float64]) -> _Drawn:
-        """Return what the kernel draws, where two parameters are sides in place of the pupil's."""
+    def _sized(self, part: _Part, sides: NDArray[np.float64]) -> _Part:
+        """Return a part whose slopes by the pupil's first two parameters are those by the sides."""
         scale = np.maximum(1 + sides, NARROWEST)
         found = part.openings
         cut = replace(
@@ -987,8 +979,8 @@ class Shadow:
         for axis, side in enumerate(("width", "height")):
             slopes[:, axis, OF_BOX.index(side)] = 2 * places[:, axis] / scale[axis]
         boxes = _boxes_of(cut, self.mask, CUT_WIDTHS, slopes)
-        sums = part.weights.sums[:2].copy()
-        return _Drawn(self._wide_tables, boxes, part.weights._replace(sums=sums))
+        weights = part.weights._replace(sums=part.weights.sums[:2].copy())
+        return replace(part, boxes=boxes, weights=weights)
 
     @cached_property
     def _wide_tables(self) -> NDArray[np.float64]:
@@ -1093,18 +1085,18 @@ class Shadow:
 
         def read(part: _Part, pixels: Pixels, channels: NDArray[np.uint8], out: _Seen) -> None:
             views_open, stage_um, frame = opening
-            drawn = _Drawn(self._tables, part.boxes, part.weights)
+            tables = self._tables
             if narrower is not None:
-                drawn = self._sized(part, narrower)
+                part, tables = self._sized(part, narrower), self._wide_tables
             _read(
                 np.ascontiguousarray(pixels, dtype=np.int64),
                 np.ascontiguousarray(channels, dtype=np.uint8),
                 self.mask.cells[frame % len(self.mask.cells)],
-                drawn.tables if slopes else drawn.tables[:1],
+                tables if slopes else tables[:1],
                 self._turns,
                 self._rays(stage_um),
-                drawn.boxes.of_views(np.asarray(views_open, dtype=bool)),
-                drawn.weights,
+                part.boxes.of_views(np.asarray(views_open, dtype=bool)),
+                part.weights,
                 out,
             )
 

@@ -25,6 +25,7 @@ from emmc_rig.calibration.boards import (
     LAMP_COLOURS,
     BoardFrame,
     BoardSet,
+    ratio_of,
     signal_of,
 )
 from emmc_rig.calibration.errors import CalibrationError
@@ -110,8 +111,10 @@ def measure_psi(
     white = np.zeros(design.frames_shape, dtype=np.float32)
     for shot, reading in enumerate(white):
         for reference in _references(boards, gain, design, shot):
+            dark, least = boards.dark_at(reference.exposure_s), DARKEST_REFERENCE_DN
             for rows in bands(reading):
-                reading[rows] += _reference_signal(boards, gain, reference, rows)[0]
+                signal = signal_of(reference, dark, gain, rows)[0]
+                reading[rows] += np.maximum(signal, least / reference.exposure_s)
     return Calibration(design.psi(weights), deviation, boards.dark.mean_dn, white, gain)
 
 
@@ -145,21 +148,17 @@ def measured_planes(
                 pinhole = _require_frame(boards, None if taken is None else taken.frame, name)
                 dark = boards.dark_at(pinhole.exposure_s)
                 values, deviation = (np.empty(layout.size, dtype=np.float32) for _ in range(2))
+                white = references[stored]
+                how = pinhole, dark, white, boards.dark_at(white.exposure_s), gain
                 for rows in bands(pinhole.mean_dn):
-                    signal, variance = signal_of(pinhole, dark, gain, rows)
-                    white, white_variance = _reference_signal(
-                        boards, gain, references[stored], rows
-                    )
-                    ratio = signal / white
-                    relative = white_variance / white**2
-                    spread = np.sqrt(variance / white**2 + ratio**2 * relative)
+                    ratio, variance, _ = ratio_of(*how, rows)
                     samples = slice(k * rows.start, k * rows.stop)
                     share = 1 / (k**2 * len(lamps))
                     if designed is not None and k > 1:
                         plane = designed[shot, v, u, samples, stored]
                         share = _designed_shares(plane, k) / len(lamps)
                     values[samples] = share * _repeat_samples(np.maximum(ratio, 0), k)
-                    deviation[samples] = share * _repeat_samples(spread, k)
+                    deviation[samples] = share * _repeat_samples(np.sqrt(variance), k)
                 yield (shot, v, u, stored), values, deviation
 
 
@@ -225,17 +224,6 @@ def _require_frame(boards: BoardSet, frame: MeanFrame | None, what: str) -> Mean
     if frame.mean_dn.shape != boards.dark.mean_dn.shape:
         raise CalibrationError(f"whiteboard {what}: another size than the dark frame")
     return frame
-
-
-def _reference_signal(
-    boards: BoardSet, gain: SensorGain, frame: MeanFrame, rows: slice
-) -> tuple[Array, Array]:
-    """Return `signal_of` a reference whiteboard.
-
-    A few hot or dead pixels, which no route uses, are taken as just bright enough.
-    """
-    signal, variance = signal_of(frame, boards.dark_at(frame.exposure_s), gain, rows)
-    return np.maximum(signal, DARKEST_REFERENCE_DN / frame.exposure_s), variance
 
 
 def _repeat_samples(pixels: Array, binning: int) -> Array:

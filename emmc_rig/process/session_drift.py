@@ -17,8 +17,9 @@ from emmc_rig.calibration.colours import mixing
 from emmc_rig.calibration.defects import mask_with_losses
 from emmc_rig.calibration.drift import Drift, DriftSettings, find_drift
 from emmc_rig.calibration.fit import fit_placement
+from emmc_rig.calibration.openings import views_open
 from emmc_rig.calibration.parametric import SAMPLED, Stages, psi_at, shot_stages
-from emmc_rig.calibration.placement import SCALARS, Placement, with_aperture_mean_one
+from emmc_rig.calibration.placement import SCALARS, Placement, as_weights, with_aperture_mean_one
 from emmc_rig.calibration.shadow import ANY_COLOUR, Shadow, ShadowMask, shadow_mask
 from emmc_rig.errors import AppError
 from emmc_rig.model.camera import camera_of, psi_layout
@@ -107,8 +108,7 @@ def _stored_placement(stored: StoredArrays) -> Placement:
     names = [name for name in SCALARS if name in attributes or not name.startswith(later)]
     scalars = {name: float(np.asarray(attributes[name])) for name in names}
     pupil = Pupil.model_validate_json(str(attributes["pupil"])) if "pupil" in attributes else None
-    aperture = tuple(tuple(map(float, row)) for row in rows)
-    return Placement(**scalars, aperture=aperture, pupil=pupil)
+    return Placement(**scalars, aperture=as_weights(rows), pupil=pupil)
 
 
 def _pixel_coefficients(psi: Psi, values: Array) -> Array:
@@ -137,24 +137,14 @@ def _planes_as_boards(
         values, spread, stored = values.sum(2, keepdims=True), spread.sum(2, keepdims=True), 1
     boards = []
     for v, u, c in np.ndindex(*values.shape[:2], stored):
-        views_open = np.zeros(values.shape[:2], dtype=bool)
-        views_open[v, u] = True
+        opened = views_open(psi.views, (v, u))
         reading, sure = stored * values[v, u, c], stored * spread[v, u, c]
         variance = np.square(sure) + 1e-12
         if good is not None:
             variance = np.where(good, variance, np.inf)
         channels = np.full(reading.shape, c, np.uint8) if colour is None else colour[0]
-        boards.append(
-            Board(
-                f"view ({v}, {u})",
-                reading.astype(np.float32),
-                variance.astype(np.float32),
-                channels,
-                views_open,
-                stages[0],
-                0,
-            )
-        )
+        seen = reading.astype(np.float32), variance.astype(np.float32), channels
+        boards.append(Board(f"view ({v}, {u})", *seen, opened, stages[0], 0))
     return boards
 
 
@@ -173,9 +163,8 @@ def _with_views_of_psi(known: Known) -> Placement:
     shadow = Shadow(known.seen_mask, known.placement)
     model = shadow.coefficients(pixels, channels, known.stages[0])
     ratio = coefficients[:, :, y, x].sum(axis=-1) / model.sum(axis=0)
-    weights = np.array(known.placement.aperture) * ratio
-    rows = tuple(tuple(map(float, row)) for row in weights)
-    return with_aperture_mean_one(replace(known.placement, aperture=rows))
+    weights = as_weights(np.array(known.placement.aperture) * ratio)
+    return with_aperture_mean_one(replace(known.placement, aperture=weights))
 
 
 def run_drift(

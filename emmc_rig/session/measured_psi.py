@@ -83,8 +83,9 @@ def open_scale(place: Path) -> Scale:
         if "darks" in attributes:
             facts = parse_json(str(attributes["darks"]), str(beside), ValueError)
             means = stored.array("darks_dn")
+            # Version 0.4 wrote the covariance with the next row as well.
             darks = tuple(
-                MeanFrame(mean, **{**known, "rows_dn2": tuple(known["rows_dn2"])})
+                MeanFrame(mean, **{**known, "rows_dn2": float(np.ravel(known["rows_dn2"])[0])})
                 for mean, known in zip(means, facts, strict=True)
             )
             shots = tuple(int(shot) for shot in np.asarray(attributes["shots"]))

@@ -230,18 +230,6 @@ def test_the_kernel_gives_the_evidence_of_its_definition(stored):
     assert got == pytest.approx(expected, rel=1e-9)
 
 
-def test_evidence_does_not_depend_on_the_brightness_of_the_scene():
-    rng = np.random.default_rng(1)
-    coefficients = rng.random((3, 1, 1, 16, 2, 2))
-    colours = np.zeros((3, 1, 16), np.uint8)
-    readings = rng.random((3, 1, 16)) + 1
-    prior = plane_prior((2, 2), 4, np.array([0.0]))
-    chosen = np.zeros((3, 1), np.int64)
-    once = log_evidence(prior, coefficients, colours, readings, np.zeros((3, 1, 16)), chosen)
-    thrice = log_evidence(prior, coefficients, colours, 3 * readings, np.zeros((3, 1, 16)), chosen)
-    np.testing.assert_allclose(thrice, once - 16 * np.log(3), rtol=1e-9)
-
-
 def test_the_average_over_disparities_is_that_of_likelihoods():
     evidence = np.log(np.array([[1.0, 3.0], [2.0, 2.0]]))
     np.testing.assert_allclose(averaged(evidence - 1e4), np.log([2.0, 2.0]) - 1e4)

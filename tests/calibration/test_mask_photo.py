@@ -134,17 +134,6 @@ def test_greys_need_clear_glass_around_them():
         read_mask(photograph(truth), CELLS)
 
 
-def test_corners_are_found_within_a_fifth_of_a_cell():
-    """Without tilt and bow they lie where the margin of 1.3 puts them."""
-    rows, columns = CELLS
-    found = find_corners(
-        photograph(binary(), tilt=(0, 0, 0), bow=0)[..., None].astype(np.float32), CELLS
-    )
-    left, top = ((int(13 * n) - 10 * n) / 2 - 0.5 for n in (columns, rows))
-    ends = [(0, 0), (columns, 0), (columns, rows), (0, rows)]
-    np.testing.assert_allclose(found, np.array([left, top]) + 10 * np.array(ends), atol=2)
-
-
 def test_given_corners_serve_where_no_outline_is_seen():
     whole = plain()
     found = find_corners(whole[..., None].astype(np.float32), CELLS)

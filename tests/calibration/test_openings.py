@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import yaml
-from whiteboard_bench import BenchTruth, Setting, WhiteboardBench
 
 from emmc_rig.calibration.openings import parts, views_open, window_place_um
 from emmc_rig.formats.cameras import find_camera
@@ -32,14 +31,6 @@ def test_the_windows_edge_lies_between_two_cells():
     x_um, y_um = window_place_um((2, -1), (5, 5), cell_um=100.0, side_um=530.0)
     assert x_um - 530 / 2 == pytest.approx(-250 + 2 * 100)
     assert y_um + 530 / 2 == pytest.approx(250 - 100)
-
-
-@pytest.mark.parametrize("window", parts((5, 5)))
-def test_a_part_of_the_aperture_reads_the_sum_of_its_views(window):
-    bench = WhiteboardBench(CAMERA, (24, 32), BenchTruth(rays_per_view=16))
-    opened = np.argwhere(views_open(CAMERA.views, None, window)).tolist()
-    alone = [bench.reading(Setting(pinhole=(v, u))) for v, u in opened]
-    np.testing.assert_allclose(bench.reading(Setting(window=window)), np.sum(alone, 0), atol=1e-9)
 
 
 @pytest.mark.parametrize(("size", "opens_every_view"), [("32x40", True), ("192x256", False)])

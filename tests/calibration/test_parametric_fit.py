@@ -18,20 +18,15 @@ from whiteboard_bench import (
 
 from emmc_rig.calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
 from emmc_rig.calibration.causes import HOLES, LAMP, FoundCause, through_pinhole
-from emmc_rig.calibration.choice import HeldOut, choose, judge, predicted_by_shadow
-from emmc_rig.calibration.defects import find_defects, loss_variance, mask_with_losses
+from emmc_rig.calibration.choice import HeldOut, choose
+from emmc_rig.calibration.defects import find_defects
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.findings import cause_lines, fit_advice
-from emmc_rig.calibration.fit import FitSettings, fit_placement, shares_of_prior
+from emmc_rig.calibration.fit import fit_placement
 from emmc_rig.calibration.locator import register
-from emmc_rig.calibration.openings import CENTRED, parts, views_open
-from emmc_rig.calibration.parametric import psi_at, psi_deviation, psi_information, shot_stages
+from emmc_rig.calibration.parametric import psi_deviation, shot_stages
 from emmc_rig.calibration.placement import (
-    SCALARS,
-    Placement,
-    Tolerances,
     designed_placement,
-    labels,
 )
 from emmc_rig.calibration.routes import calibrate
 from emmc_rig.calibration.shadow import Shadow, shadow_mask
@@ -73,18 +68,6 @@ def outcome(bench, design, few):
     return calibrate(CAMERA, design, ("parametric", "mixed"), bench.capture(HELD_OUT), few)
 
 
-def test_the_fit_finds_where_the_mask_sits(outcome):
-    at = outcome.parametric.fit.placement
-    assert at.offset_x_um == pytest.approx(31.0, abs=0.02 * 24)
-    assert at.offset_y_um == pytest.approx(-22.0, abs=0.02 * 24)
-    assert np.degrees(at.rotation_rad) == pytest.approx(0.15, abs=0.005)
-    assert 1 + at.distance_share == pytest.approx(1.05, rel=0.005)
-    assert at.scale == pytest.approx(1.002, abs=1e-4)
-    assert at.clear == pytest.approx(ORDINARY_BENCH.optics.clear, abs=0.003)
-    assert at.leak == pytest.approx(ORDINARY_BENCH.optics.leak, abs=0.003)
-    assert outcome.parametric.fit.status == "converged"
-
-
 def test_dust_is_found_and_psi_is_better_for_it(bench, design, outcome):
     exact = bench.exact_psi(design)
     errors = {
@@ -101,12 +84,6 @@ def test_bad_pixels_are_found_and_left_out(bench, outcome):
     assert not outcome.good[hot | dead].any()
     assert (~outcome.good).sum() <= (hot | dead).sum() + 3
     assert not outcome.calibration.good[hot | dead].any()
-
-
-def test_one_frame_verifies_a_stage_position_that_was_never_calibrated(outcome, bench, design):
-    boards = as_readings(bench.capture([Setting(stage_um=(133.0, -71.0))]), design, outcome.good)
-    judged = judge("mixed", boards[0], predicted_by_shadow(outcome.mixed.shadow, boards[0]))
-    assert judged.relative_error < 0.01
 
 
 def synthetic(design, placement, noise=0.004, seed=0, settings=FEW):
@@ -134,107 +111,6 @@ def test_brightness_that_repeats_show_to_differ_counts_in_the_fit(design):
     assert less.deviation("clear") == pytest.approx(0.02 / 2 * less.placement.clear, rel=0.2)
     assert known.deviation("clear") < 0.4 * less.deviation("clear")
     assert known.brightness_spread < 0.001 > less.brightness_spread
-
-
-def cramer_rao(boards, shadow):
-    """The inverse of the Fisher information of all readings, with the prior."""
-    information = np.diag(1 / Tolerances().deviations(VIEWS) ** 2)
-    for board in boards:
-        slopes = shadow.with_slopes(PIXELS, board.channels.ravel(), *board.opening)[1]
-        information += slopes.T @ (slopes / np.broadcast_to(board.variance, SIZE).reshape(-1, 1))
-    return np.linalg.inv(information)
-
-
-@pytest.mark.slow
-def test_the_fit_reaches_the_bound_and_states_its_covariance(design):
-    truth = replace(
-        designed_placement(CAMERA), offset_x_um=4.0, rotation_rad=0.001, blur_um=3.0, leak=0.02
-    )
-    fits, bounds = [], []
-    for seed in range(8):
-        boards = synthetic(design, truth, 0.02, seed)
-        settings = FitSettings(seed=seed, first_pixels=1500)
-        fits.append(fit_placement(boards, CAMERA, MASK, settings, start=truth))
-        bounds.append(np.diag(cramer_rao(boards, Shadow(MASK, truth))))
-    errors = np.array([fit.placement.vector() - truth.vector() for fit in fits])
-    stated = np.mean([np.diag(fit.covariance) for fit in fits], axis=0)
-    bound = np.mean(bounds, axis=0)
-    names = labels(VIEWS)
-    reported = [i for i, name in enumerate(names) if name not in fits[0].undecided][:11]
-    ratio = np.mean(errors[:, reported] ** 2 / bound[reported])
-    # 8 x 11 nearly independent squares: their mean is known to 0.16.
-    assert ratio == pytest.approx(1.05, abs=0.5)
-    assert np.all(stated[reported] >= 0.99 * bound[reported])
-    # What is beyond is for displacements of single views, which so few pixels do not rule out.
-    assert np.all(stated[reported] < 2 * bound[reported])
-
-
-@pytest.mark.slow
-def test_the_noise_of_the_reference_is_that_of_all_whiteboards(design):
-    truth, rng = replace(designed_placement(CAMERA), blur_um=3.0), np.random.default_rng(5)
-    chosen = [labels(VIEWS).index(name) for name in ("clear", "vignetting")]
-    white2 = np.full(SIZE, 0.02**2, np.float32)
-    fits, alone = [], []
-    for seed in range(24):
-        darker = 1 - rng.normal(0, 0.02, SIZE)
-        boards = [
-            replace(
-                board,
-                reading=(board.reading * darker).astype(np.float32),
-                variance=board.variance + np.square(board.reading) * white2,
-            )
-            for board in synthetic(design, truth, seed=seed)
-        ]
-        for shared, found in ((white2, fits), (None, alone)):
-            each = [replace(board, white2=shared) for board in boards]
-            settings = FitSettings(seed=seed, first_pixels=1500)
-            found.append(fit_placement(each, CAMERA, MASK, settings, start=truth))
-    spread = np.std([fit.placement.vector()[chosen] for fit in fits], axis=0, ddof=1)
-    stated, of_own = (
-        np.mean([np.sqrt(np.diag(fit.covariance))[chosen] for fit in found], axis=0)
-        for found in (fits, alone)
-    )
-    # The deviation of 24 is known to 15 %.
-    assert np.all(np.abs(spread / stated - 1) < 0.35)
-    # The level is less sure than if every whiteboard had its own reference, a slope surer.
-    assert stated[0] > 1.2 * of_own[0]
-    assert stated[1] < 0.8 * of_own[1]
-
-
-@pytest.mark.slow
-def test_views_displaced_on_their_own_bias_the_weights_by_as_much_as_is_stated(design):
-    truth = replace(designed_placement(CAMERA), blur_um=3.0, leak=0.02)
-    shadow, rng = Shadow(MASK, truth), np.random.default_rng(3)
-    channels = design.colour[0]
-    # Between views alike far from the middle: neither a common level nor a falloff is in them.
-    pairs = np.array([(0, 2), (0, 6), (0, 8), (1, 7), (3, 5)]) + len(SCALARS)
-    contrasts = np.zeros((len(pairs), len(truth.vector())))
-    contrasts[np.arange(len(pairs)), pairs[:, 0]] = 1
-    contrasts[np.arange(len(pairs)), pairs[:, 1]] = -1
-    scaled, by_bound = [], []
-    for seed in range(4):
-        places = rng.normal(0, 0.3, (*VIEWS, 2))
-        each = np.empty((*VIEWS, *SIZE))
-        for v, u in np.ndindex(VIEWS):
-            alone = np.zeros(VIEWS, dtype=bool)
-            alone[v, u] = True
-            x, y = places[v, u]
-            each[v, u] = shadow.readings(PIXELS, channels.ravel(), alone, (x, y)).reshape(SIZE)
-        boards = []
-        for window in (CENTRED, *parts(VIEWS)):
-            opened = views_open(VIEWS, None, window)
-            read = each[opened].sum(axis=0)
-            deviation = np.full(SIZE, 0.001, np.float32)
-            read = read + deviation * rng.standard_normal(SIZE)
-            reading, variance = read.astype(np.float32), deviation**2
-            boards.append(Board("", reading, variance, channels, opened, (0.0, 0.0), 0))
-        settings = FitSettings(seed=seed, first_pixels=1500)
-        fit = fit_placement(boards, CAMERA, MASK, settings, start=truth)
-        off = contrasts @ (fit.placement.vector() - truth.vector())
-        scaled.append(off**2 / np.diag(contrasts @ fit.covariance @ contrasts.T))
-        by_bound.append(off**2 / np.diag(contrasts @ cramer_rao(boards, shadow) @ contrasts.T))
-    assert np.mean(by_bound) > 3
-    assert 0.3 < np.mean(scaled) < 2
 
 
 def test_a_mask_that_is_not_the_design_is_refused_with_the_correlation(design, bench, few):
@@ -310,21 +186,6 @@ def test_a_cause_is_named_only_for_whiteboards_where_it_is_far_outside_its_devia
         assert all(words in line for words, line in zip(named, said, strict=True))
 
 
-def test_a_share_of_the_light_known_to_the_prior_is_as_unsure_as_the_prior():
-    count, tolerances = VIEWS[0] * VIEWS[1], Tolerances()
-    weights = tuple(tuple(row) for row in np.linspace(0.5, 1.5, count).reshape(VIEWS).tolist())
-    covariance = np.zeros((len(SCALARS) + count, len(SCALARS) + count))
-    spread = tolerances.aperture * np.ravel(weights)
-    covariance[-count:, -count:] = np.diag(spread**2)
-    found = shares_of_prior(MASK, Placement(aperture=weights), covariance, tolerances)
-    # Of nine independent logarithms each less their mean: (1 - 1/9) of the variance is left.
-    np.testing.assert_allclose(found[-count:], np.sqrt(8 / 9))
-    assert found[: len(SCALARS)].max() == 0
-    half = shares_of_prior(MASK, Placement(aperture=weights), covariance / 4, tolerances)
-    np.testing.assert_allclose(half[-count:], np.sqrt(8 / 9) / 2)
-    assert len(tolerances.deviations(VIEWS)) == len(found)
-
-
 def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):
     boards = synthetic(design, designed_placement(CAMERA), 0.05, settings=FEW[:1])
     fit = fit_placement(boards, CAMERA, MASK)
@@ -353,53 +214,10 @@ def test_deviations_of_psi_do_not_depend_on_the_bands_they_are_computed_in(desig
     np.testing.assert_array_equal(*found)
 
 
-def test_what_the_losses_of_a_speck_leave_unsure_is_that_of_its_grains_together(design):
-    truth = replace(designed_placement(CAMERA), blur_um=3.0)
-    middle = np.array(MASK.cells.shape[1:3]) // 2
-    lost = np.zeros((2 * MASK.cells.shape[1], 2 * MASK.cells.shape[2]))
-    lost[2 * middle[0] : 2 * middle[0] + 2, 2 * middle[1] : 2 * middle[1] + 2] = 0.5
-    boards, soiled = synthetic(design, truth, 0.005), mask_with_losses(MASK, truth, lost)
-    for i, board in enumerate(boards):
-        args = PIXELS, board.channels.ravel(), board.views_open, board.stage_um, board.shot
-        taken = Shadow(MASK, truth).readings(*args) - Shadow(soiled, truth).readings(*args)
-        boards[i] = replace(board, reading=(board.reading - taken.reshape(SIZE)).astype(np.float32))
-    found = find_defects(boards, MASK, truth)
-    assert found.count > 0
-    seen = np.ones(VIEWS, dtype=bool), (0.0, 0.0), 0
-    channels = design.colour[0].ravel()
-    variance = loss_variance(found, MASK, truth, PIXELS, channels, seen)
-    grains = np.flatnonzero(found.lost)
-    dense = found.covariance[grains][:, grains].toarray()
-    root = np.linalg.cholesky(dense + 1e-12 * np.trace(dense) * np.eye(len(grains)))
-    rng, spread = np.random.default_rng(0), []
-    for _ in range(200):
-        drawn = np.zeros(found.lost.size)
-        drawn[grains] = root @ rng.standard_normal(len(grains))
-        other = mask_with_losses(MASK, truth, drawn.reshape(found.lost.shape))
-        spread.append(Shadow(other, truth).readings(PIXELS, channels, *seen))
-    touched = variance > 0.1 * variance.max()
-    ratio = np.var(spread, axis=0)[touched] / variance[touched]
-    # 200 draws tell a variance to 10 %.
-    assert ratio.mean() == pytest.approx(1, abs=0.25)
-
-
 def test_no_defects_are_found_on_a_clean_mask(design):
     truth = replace(designed_placement(CAMERA), blur_um=3.0)
     boards = synthetic(design, truth)
     assert find_defects(boards, MASK, truth).count == 0
-
-
-def test_the_expected_error_of_psi_is_the_error_of_psi(design):
-    truth = replace(designed_placement(CAMERA), blur_um=3.0)
-    exact = psi_at(Shadow(MASK, truth), design, shot_stages(CAMERA))
-    squares, expected = [], []
-    for seed in range(4):
-        fit = fit_placement(synthetic(design, truth, 0.03, seed), CAMERA, MASK, start=truth)
-        psi = psi_at(Shadow(MASK, fit.placement), design, shot_stages(CAMERA))
-        squares.append(psi.relative_difference(exact) ** 2)
-        matrix, power = psi_information(Shadow(MASK, fit.placement))
-        expected.append(np.trace(matrix @ fit.covariance) / power)
-    assert np.sqrt(np.mean(squares) / np.mean(expected)) == pytest.approx(1, abs=0.35)
 
 
 def test_frames_of_another_camera_are_refused(few, design):

@@ -78,17 +78,6 @@ def test_behind_pupil_and_rim_the_shadow_is_that_of_the_camera_model(rim):
     assert found.relative_difference(design) < 3e-3
 
 
-def test_an_open_whiteboard_is_the_sum_of_the_coefficients():
-    camera = camera_of()
-    design = build_imaging_matrix(camera, SIZE)
-    shadow = Shadow(shadow_mask(camera, SIZE), sharp(camera))
-    every = np.ones(VIEWS, dtype=bool)
-    assert design.colour is not None
-    read = shadow.readings(everywhere(), design.colour[0].ravel(), every)
-    white = design.forward(np.ones(design.light_field_shape, np.float32))[0]
-    np.testing.assert_allclose(read.reshape(SIZE), white, atol=2e-4)
-
-
 def askew(camera):
     rng = np.random.default_rng(0)
     weights = tuple(tuple(1 + 0.1 * row) for row in rng.standard_normal(VIEWS))
@@ -189,16 +178,6 @@ def test_a_cut_view_casts_the_shadow_of_its_open_part():
         assert off < 4e-3
 
 
-def test_moving_the_stage_is_moving_the_mask():
-    camera = camera_of()
-    mask, at = shadow_mask(camera, SIZE), askew(camera)
-    pixels, colours = everywhere(), np.full(SIZE[0] * SIZE[1], ANY_COLOUR, np.uint8)
-    every = np.ones(VIEWS, dtype=bool)
-    staged = Shadow(mask, at).readings(pixels, colours, every, (30.0, -11.0))
-    moved = replace(at, offset_x_um=at.offset_x_um + 30.0, offset_y_um=at.offset_y_um - 11.0)
-    np.testing.assert_allclose(staged, Shadow(mask, moved).readings(pixels, colours, every))
-
-
 def test_brightness_of_the_whole_aperture_cancels_against_the_reference():
     camera = camera_of()
     mask, at = shadow_mask(camera, SIZE), askew(camera)
@@ -209,14 +188,6 @@ def test_brightness_of_the_whole_aperture_cancels_against_the_reference():
     np.testing.assert_allclose(read, Shadow(mask, brighter).readings(pixels, colours, every))
     normal = with_aperture_mean_one(brighter)
     assert np.mean(normal.aperture) == pytest.approx(1)
-
-
-def test_a_clear_plate_reads_its_transmittance_everywhere():
-    camera = camera_of(pattern={"kind": "open"})
-    mask, at = shadow_mask(camera, SIZE), askew(camera)
-    pixels, colours = everywhere(), np.zeros(SIZE[0] * SIZE[1], np.uint8)
-    read = Shadow(mask, at).readings(pixels, colours, np.ones(VIEWS, dtype=bool))
-    np.testing.assert_allclose(read, at.clear, rtol=1e-9)
 
 
 @pytest.mark.parametrize("blur_um", [0.3, 3.0, 12.0])
@@ -241,23 +212,6 @@ def test_the_shares_of_the_cells_sum_to_one_and_their_derivatives_to_none(blur_u
         at = grid + reach + place / TABLE_STEPS
         shares, _ = np.histogram(at, np.arange(tables.shape[2] + 1), weights=density)
         np.testing.assert_allclose(tables[0][place], shares, atol=2e-3)
-
-
-def test_a_footprint_list_gives_the_same_reading():
-    camera = camera_of()
-    mask, at = shadow_mask(camera, SIZE), askew(camera)
-    shadow, pixels = Shadow(mask, at), everywhere()
-    colours = np.zeros(len(pixels), np.uint8)
-    every = np.ones(VIEWS, dtype=bool)
-    corners, down, across, weights = shadow.footprints(pixels, every, (4.0, 0.0))
-    read = np.zeros(len(pixels))
-    for view in range(corners.shape[1]):
-        for a in range(down.shape[2]):
-            for b in range(across.shape[2]):
-                cell = mask.cells[0, corners[:, view, 0] + a, corners[:, view, 1] + b, 0]
-                share = weights[:, view] * down[:, view, a] * across[:, view, b]
-                read += share * (at.leak + (at.clear - at.leak) * cell)
-    np.testing.assert_allclose(read, shadow.readings(pixels, colours, every, (4.0, 0.0)), rtol=3e-3)
 
 
 def test_a_camera_without_one_mask_before_its_sensor_is_sent_to_method_free():

@@ -35,7 +35,6 @@ COLOUR_REPEATS = 2
 BOARD_LEVEL = 0.7
 RAYS_PER_VIEW = 512
 ORDINARY_BENCH = flawed(Flaws(), [ORDINARY])
-VERIFY_UM = (-207.0, 118.0)
 
 
 @dataclass(frozen=True)
@@ -278,11 +277,6 @@ class WhiteboardBench:
         finally:
             self.bench.target = "whiteboard"
         return np.stack(frames), exposures_s
-
-
-def held_out_settings() -> list[Setting]:
-    """Return the whiteboards to judge by: where shot 0 is, and where the stage has not been."""
-    return [Setting(0), Setting(0, stage_um=VERIFY_UM)]
 
 
 def moved_truth(truth: BenchTruth, x_um: float, y_um: float) -> BenchTruth:

@@ -68,25 +68,6 @@ def test_the_time_of_a_window_predicts_that_of_the_whole(capture, monkeypatch):
     assert 1 / 3 < expected / (time.perf_counter() - started) < 3
 
 
-@pytest.mark.parametrize(("binning", "size"), [(2, (200, 118)), (1, (20, 24))])
-def test_the_window_keeps_pixels_whole(random_psi, monkeypatch, binning, size):
-    psi = random_psi(1, (3, 3), size, 1, binning)
-    rows = np.arange(psi.frames_shape[1])[None, :, None] * np.ones(psi.frames_shape)
-    seen = []
-
-    def solve(method, part, frames):
-        seen.append((part, frames.readings))
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(cost, "reconstruct", solve)
-    with pytest.raises(ZeroDivisionError):
-        timed(psi, Frames(rows, rows, rows >= 0))
-    ((part, readings),) = seen
-    assert part.size == (min(96, size[0]), min(96, size[1]))
-    assert readings.shape == part.frames_shape
-    assert readings[0, 0, 0] == (psi.frames_shape[1] - part.frames_shape[1]) // 2
-
-
 @pytest.mark.slow
 def test_reconstruct_chooses_by_the_time(run, tmp_path):
     scene = ("--scene", "dark", "--camera", "rgbw-bayer-1shot", "--size", "32x40")

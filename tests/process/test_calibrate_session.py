@@ -19,7 +19,6 @@ from emmc_rig.model.camera import build_imaging_matrix
 from emmc_rig.model.sensing import Psi
 from emmc_rig.session import board_sets
 from emmc_rig.session.board_sets import camera_of
-from emmc_rig.session.readings import session_frames
 from emmc_rig.session.session import Session
 from emmc_rig.simulators.bench import MountingErrors
 from emmc_rig.simulators.effects import flawed
@@ -42,18 +41,6 @@ def captured(tmp_path_factory):
     return folder
 
 
-def test_the_plan_written_is_one_that_captures(captured):
-    plan = load_plan(captured / "plan" / "plan.yaml")
-    assert plan.whiteboards is not None
-    kinds = [board.validation for board in plan.whiteboards.open]
-    assert True in kinds
-    assert False in kinds
-    metrics = json.loads((captured / "plan" / "metrics.json").read_text())
-    planned = [metric["frames"] for metric in metrics["whiteboards"] if not metric["pinhole"]]
-    assert [b.repeats for b in plan.whiteboards.open if not b.validation] == planned
-    assert plan.whiteboards.views == "all"
-
-
 def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captured, capsys):
     out = captured / "calibration"
     assert exit_code("calibrate", captured / "session", "--out", out) == 0
@@ -71,14 +58,6 @@ def test_a_session_is_calibrated_and_finds_the_mask_where_the_bench_has_it(captu
     psi = Psi.load(out / "psi.h5")
     assert design.relative_difference(psi) > 10 * judged["relative_error"]
     assert "session" in (out / "report.html").read_text()
-
-
-def test_a_session_is_read_by_the_psi_that_its_open_whiteboards_give(captured):
-    used, found = session_frames(Session(captured / "session"))
-    psi = Psi.load(captured / "calibration" / "psi.h5")
-    np.testing.assert_allclose(used.weights, psi.weights, rtol=1e-4, atol=1e-6)
-    assert found.usable.mean() > 0.95
-    assert np.isfinite(found.readings[found.usable]).all()
 
 
 def test_the_method_free_takes_the_same_session(captured):

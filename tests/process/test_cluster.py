@@ -1,30 +1,22 @@
 """A Dask cluster computes the blocks: the same bytes as a local run, and faults in a line."""
 
-import errno
 import json
-import os
-import pickle
 import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numba
-import numpy as np
 import pytest
 from programs import program
 
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.formats.cameras import find_camera
-from emmc_rig.process import block_tasks
-from emmc_rig.process.block_tasks import BlockJob, BlockTask
 from emmc_rig.process.captures import opened_capture
 from emmc_rig.process.reconstructing import reconstruct_undrawn
 from emmc_rig.progress import Watcher
 from emmc_rig.reconstruction.method import BlockSettings
 from emmc_rig.reconstruction.methods import MethodSettings
-from emmc_rig.reconstruction.tiles import CaptureSurvey, Grid
 from emmc_rig.reconstruction.tv import TVSettings
 from emmc_rig.store import pool as pools
 from emmc_rig.store.folders import result_folder
@@ -122,34 +114,6 @@ def test_workers_of_another_version_are_refused(cluster, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_full_disk_on_one_worker_is_one_line_and_the_same_command_goes_on(
-    cluster, monkeypatch, tmp_path
-):
-    frames, settings = tmp_path / "frames", tmp_path / "blocks.yaml"
-    frames.mkdir()
-    simulate_into(frames, SCENE, CAMERA, find_camera(CAMERA), SIZE, 0)
-    settings.write_text(SETTINGS.model_dump_json(exclude_unset=True))
-    given = (
-        "reconstruct", frames, "--method", "tv", "--settings", settings, "--out", tmp_path / "out",
-        "--cluster", cluster.scheduler_address,
-    )  # fmt: skip
-    written, first = block_tasks._write, threading.Lock()
-
-    def write_arrays(path, arrays, about):
-        if path.name.startswith("block-") and first.acquire(blocking=False):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return written(path, arrays, about)
-
-    monkeypatch.setattr(block_tasks, "_write", write_arrays)
-    code, _, err = program(*given)
-    assert (code, "No space left" in err, "Traceback" in err) == (1, True, False), err
-    assert not (tmp_path / "out/light_field.h5").exists()
-    code, _, err = program(*given)
-    assert code == 0, err
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
 def test_a_scheduler_that_is_killed_is_one_line(monkeypatch, tmp_path):
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
     monkeypatch.setattr(pools, "CONNECT_S", 10.0)
@@ -180,13 +144,3 @@ def test_a_scheduler_that_is_killed_is_one_line(monkeypatch, tmp_path):
         for part in parts:
             part.kill()
             part.wait()
-
-
-def test_arrays_do_not_travel_with_the_tasks():
-    """A task is names and numbers: what 64 workers ask a scheduler for stays small."""
-    job = BlockJob(Path("/kept"), Path("/psi.h5"), "adaptive", None, SETTINGS, 0.01, "0" * 64)
-    block = Grid((8000, 6000), 2, 40, MethodSettings().blocks).block(3, 4)
-    assert (
-        len(pickle.dumps(BlockTask(job, CaptureSurvey.of_one_block(SETTINGS, 3), block))) < 10_000
-    )
-    assert np.prod([part.stop - part.start for part in block.outer]) > 10**5

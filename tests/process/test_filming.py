@@ -2,20 +2,15 @@
 
 import gc
 import json
-import os
 import shutil
-import signal
-import subprocess
-import time
 import tracemalloc
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from pools import Here, Posting, children
-from programs import PROGRAM, one_line, program
+from pools import Here, Posting
+from programs import one_line, program
 from watching import Recorder
 
 import emmc_rig as emmc
@@ -215,22 +210,6 @@ def test_what_an_earlier_run_left_damaged_or_of_another_film_is_not_gone_on_from
     assert content(out) == content(whole)
 
 
-@pytest.mark.slow
-def test_killed_by_the_system_the_same_command_goes_on_to_the_same_bytes(session, whole, tmp_path):
-    out = tmp_path / "out"
-    command = *PROGRAM, "reconstruct", str(session), "--method", METHOD, "--out", str(out)
-    running = subprocess.Popen(command, env={**os.environ, "COLUMNS": "160"})
-    while not (out / ".emmc-rig.partial/kept/frames/000001").exists():
-        assert running.poll() is None
-        time.sleep(0.01)
-    running.send_signal(signal.SIGKILL)
-    running.wait()
-    assert not (out / "metrics.json").exists()
-    again = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "goes on with an earlier run" in again.stderr
-    assert content(out) == content(whole)
-
-
 def test_ctrl_c_says_that_frames_are_kept(session, tmp_path):
     def stop():
         raise KeyboardInterrupt
@@ -391,38 +370,6 @@ def test_killed_within_the_second_segment_each_goes_on_where_it_was(
     assert content(out) == content(in_two)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
-def test_a_worker_that_is_killed_is_replaced_and_its_segment_goes_on(session, in_two, tmp_path):
-    (tmp_path / "two.yaml").write_text("film: {segment: 4}\n")
-    out, own = tmp_path / "out", tmp_path / "out/.emmc-rig.partial/kept"
-    command = (
-        *PROGRAM, "reconstruct", str(session), "--method", METHOD, "--workers", "2", "--memory",
-        "4GiB", "--settings", str(tmp_path / "two.yaml"), "--out", str(out),
-    )  # fmt: skip
-    running = subprocess.Popen(command)
-    while not (own / "next-001.npz").exists():
-        assert running.poll() is None
-        time.sleep(0.01)
-    os.kill(children(running.pid)[-1], signal.SIGKILL)
-    assert running.wait() == 0
-    assert content(out) == content(in_two)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_a_cluster_does_segments_to_the_bytes_of_this_machine(session, in_two, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None,
-        protocol="tcp", host="127.0.0.1",
-    ) as cluster:  # fmt: skip
-        reconstructed(
-            session, tmp_path / "out", METHOD, settings=TWO, cluster=cluster.scheduler_address
-        )
-    assert content(tmp_path / "out") == content(in_two)
-
-
 def test_workers_that_one_segment_leaves_idle_are_named_with_what_to_set(session, whole, tmp_path):
     watcher = Recorder()
     reconstructed(session, tmp_path / "out", METHOD, workers=2, watcher=watcher)
@@ -525,13 +472,6 @@ def test_settings_of_films_reach_the_frames_after_the_first(psi, steps, changed)
     assert not np.array_equal(usual[2], other[2])
 
 
-def test_a_segment_of_readings_begins_as_a_first_frame_does(psi):
-    shown, settings = readings(psi, 3), {"film": {"segment": 2}}
-    *_, last = emmc.reconstruct_film(psi, shown, METHOD, noise_sigma=0.003, settings=settings)
-    alone = emmc.reconstruct(psi.of_shots([0]), shown[2:], METHOD, noise_sigma=0.003)
-    np.testing.assert_array_equal(last.light_field, alone.light_field)
-
-
 def test_a_part_of_the_textures_settings_leaves_the_rest_as_films_have_it():
     given = MethodSettings.model_validate({"film": {"texture": {"steps": 5}}})
     assert given.film.texture == FilmSettings().texture.model_copy(update={"steps": 5})
@@ -541,8 +481,6 @@ def test_a_part_of_the_textures_settings_leaves_the_rest_as_films_have_it():
     ("wrong", "what"),
     [
         ({"earlier": 0}, "film.earlier: input should be greater than or equal to 1"),
-        ({"segment": -1}, "film.segment: input should be greater than or equal to 0"),
-        ({"misfit": 0}, "film.misfit: input should be greater than 0"),
         ({"segmnt": 50}, "unknown key 'film.segmnt': did you mean 'segment'?"),
         ({"texture": {"step": 5}}, "unknown key 'film.texture.step'"),
         ({"texture": 5}, "film.texture: input should be a mapping"),
@@ -567,23 +505,6 @@ def test_memory_does_not_grow_with_the_number_of_frames(psi):
     tracemalloc.stop()
     assert carried[11] < 1.3 * carried[2]
     assert held[11] < held[2] + 2 * light_field
-
-
-def test_a_film_restored_goes_on_as_the_film_it_was_of(psi):
-    latest, settings = filming.Latest(), MethodSettings()
-    for place, part in enumerate(readings(psi, 3)):
-        frames = of_readings(part)
-        restored = Film.restored(
-            latest.film.arrays(), [psi.of_shots([shot]) for shot in latest.shots]
-        )
-        again, _ = replace(latest, film=restored).next(psi, place % 2, frames, METHOD, settings)
-        result, latest = latest.next(psi, place % 2, frames, METHOD, settings)
-        np.testing.assert_array_equal(result.light_field, again.light_field)
-        for name, values in result.maps.items():
-            np.testing.assert_array_equal(values, again.maps[name])
-    known = latest.film.known
-    assert known is not None
-    assert len(latest.shots) == len(known.earlier)
 
 
 def test_a_film_at_rest_restored_goes_on_as_the_film_it_was_of():

@@ -6,8 +6,6 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import yaml
@@ -17,9 +15,6 @@ from programs import PROGRAM
 from emmc_rig.commands.simulate import simulate_into
 from emmc_rig.errors import AppError
 from emmc_rig.formats.cameras import find_camera
-from emmc_rig.process.cost import task_bytes
-from emmc_rig.reconstruction.method import BlockSettings
-from emmc_rig.reconstruction.tiles import Grid
 from emmc_rig.store.pool import Ceiling, Processes, WorkersError
 
 CAMERA, SIZE = "rgbw-bayer-1shot", (64, 80)
@@ -33,17 +28,6 @@ def test_as_many_workers_run_as_fit_beside_the_program():
     assert ceiling.share(3) == 200 * MIB
     with pytest.raises(AppError, match=r"1000 MiB: .* need 1001 MiB; allow 1001MiB"):
         ceiling.workers(600 * MIB + 1)
-
-
-@pytest.mark.slow
-def test_a_task_needs_more_for_larger_blocks_halos_and_shots_and_never_less_than_the_survey():
-    def need(shots, side, halo):
-        psi: Any = SimpleNamespace(weights_shape=(shots, 5, 5, 4000, 1, 3000), size=(4000, 3000))
-        return task_bytes(psi, Grid(psi.size, 2, halo, BlockSettings(side=side)))
-
-    assert need(1, 300, 20) < need(1, 300, 40) < need(1, 384, 40) < need(3, 384, 40)
-    assert need(1, 384, 40) > 1.4 * 2**30
-    assert need(1, 64, 8) == need(1, 32, 8) < need(2, 32, 8)
 
 
 WITHOUT_A_LIMIT_OF_THE_SYSTEM = """
