@@ -163,7 +163,8 @@ class Board:
     reading, variance: (pixel_y, pixel_x); the variance of a pixel that is not to be used is
     infinite. channels: (pixel_y, pixel_x), the colour each pixel sees (3: all). repeats: frames
     averaged. unsteady2: relative variance of the brightness between these, see `MeanFrame`. loose:
-    see `BoardFrame`.
+    see `BoardFrame`. white2: (pixel_y, pixel_x), relative variance of the reference, which the
+    variance includes; whiteboards of one reference share the array.
     """
 
     name: str
@@ -177,6 +178,7 @@ class Board:
     repeats: int = 1
     unsteady2: float = 0.0
     loose: bool = False
+    white2: NDArray[np.float32] | None = None
 
     @property
     def opening(self) -> Opening:
@@ -229,7 +231,7 @@ def as_readings(
     gain = gain_of(boards)
     expected = layout.frames_shape[1:]
     good = np.ones(expected, dtype=bool) if usable is None else usable
-    found = []
+    found, whites2 = [], dict[int, NDArray[np.float32]]()
     for board, taken in lit_boards(boards):
         reference = boards.reference(board.shot, board.lamp)
         if reference is None:
@@ -241,7 +243,19 @@ def as_readings(
                     f"pixels, the camera has {expected[0]} x {expected[1]}: are these frames of "
                     "another camera?"
                 )
-        found.append(_board(board, taken, reference, boards, gain, layout, good))
+        if id(reference) not in whites2:
+            whites2[id(reference)] = _white2(reference, boards, gain)
+        white2 = whites2[id(reference)]
+        found.append(_board(board, taken, reference, boards, gain, layout, good, white2))
+    return found
+
+
+def _white2(reference: MeanFrame, boards: BoardSet, gain: SensorGain) -> NDArray[np.float32]:
+    """Return the relative variance of a reference, (pixel_y, pixel_x)."""
+    dark, found = boards.dark_at(reference.exposure_s), np.empty_like(reference.mean_dn, np.float32)
+    for rows in bands(found):
+        white, variance = signal_of(reference, dark, gain, rows)
+        found[rows] = variance / np.maximum(white, DARKEST_REFERENCE_DN / reference.exposure_s) ** 2
     return found
 
 
@@ -296,6 +310,7 @@ def _board(
     gain: SensorGain,
     layout: PsiLayout,
     good: NDArray[np.bool_],
+    white2: NDArray[np.float32],
 ) -> Board:
     dark, dark_of_white = (boards.dark_at(each.exposure_s) for each in (frame, reference))
     reading, variance = (np.empty(good.shape, dtype=np.float32) for _ in range(2))
@@ -324,6 +339,7 @@ def _board(
         frame.count,
         frame.unsteady2(dark.mean_dn),
         board.loose,
+        white2,
     )
 
 

@@ -24,6 +24,7 @@ Source of the loss: Holland & Welsch 1977; of the steps: Marquardt 1963.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -999,17 +1000,58 @@ def _widening_samples(boards: Sequence[Board], mask: ShadowMask) -> Iterator[lis
     yield _drawn(boards, whole_px, FIRST_PIXELS, rng)
 
 
+def _references_covariance(
+    point: _Point, samples: Sequence[Sample], covariance: Array
+) -> NDArray[np.float64]:
+    """Return what it adds to the covariance C that whiteboards share the noise of a reference.
+
+    A reference's pixel that is brighter by e makes every reading r of the pixel r e darker. With
+    g = w J r / (deviation spread^2) of a whiteboard's reading, and all g of a pixel summed first,
+
+        added = C (sum over pixels of var e ((sum g) (sum g)^T - sum g g^T)) C
+
+    The second is counted in C, as if every whiteboard had a reference of its own.
+    """
+    size, spread = len(covariance), point.normal.spread
+    added = np.zeros((size, size))
+    of_reference = defaultdict[int, list[int]](list)
+    for index, sample in enumerate(samples):
+        if sample.board.white2 is not None:
+            of_reference[id(sample.board.white2)].append(index)
+    for indices in of_reference.values():
+        white2 = samples[indices[0]].board.white2
+        assert white2 is not None
+        flat = [np.ravel_multi_index(tuple(samples[i].pixels.T), white2.shape) for i in indices]
+        drawn = np.unique(np.concatenate(flat))
+        for first in range(0, len(drawn), CHUNK):
+            pixels = drawn[first : first + CHUNK]
+            summed = np.zeros((len(pixels), size))
+            deviation = np.sqrt(white2.ravel()[pixels].astype(np.float64))
+            for index, of_board in zip(indices, flat, strict=True):
+                # Drawn pixels are in order.
+                part = slice(*np.searchsorted(of_board, [pixels[0], pixels[-1] + 1]))
+                at = np.searchsorted(pixels, of_board[part])
+                residual, slope = point.linear[index]
+                pull = tukey_weights(residual[part] / spread) / spread**2 * deviation[at]
+                pull *= slope[part, -OWN]
+                alone, places = slope[part] * pull[:, None], point.state.places(index)
+                summed[np.ix_(at, places)] += alone
+                added[np.ix_(places, places)] -= alone.T @ alone
+            added += summed.T @ summed
+    return np.asarray(covariance @ added @ covariance, np.float64)
+
+
 def _covariance(
     mask: ShadowMask, point: _Point, samples: Sequence[Sample], prior: _Prior
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Return the covariance of all parameters, and the variances of the views' own, see `Fit`.
 
-    C = (matrix + P)^-1 of all parameters, and what the views' own add.
+    C = (matrix + P)^-1 of all parameters, and what the views' own and the noise of references add.
     """
     information = point.normal.matrix + prior.precision
     covariance = np.asarray(np.linalg.inv(information), np.float64)
     of_views, astray2 = _bias_covariance(covariance, _view_terms(mask, point, samples))
-    return covariance + of_views, astray2
+    return covariance + of_views + _references_covariance(point, samples, covariance), astray2
 
 
 def _fit_power(point: _Point, samples: Sequence[Sample], covariance: Array) -> Power:

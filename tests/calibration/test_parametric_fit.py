@@ -25,9 +25,7 @@ from emmc_rig.calibration.findings import cause_lines, fit_advice
 from emmc_rig.calibration.fit import fit_placement
 from emmc_rig.calibration.locator import register
 from emmc_rig.calibration.parametric import psi_deviation, shot_stages
-from emmc_rig.calibration.placement import (
-    designed_placement,
-)
+from emmc_rig.calibration.placement import designed_placement, labels
 from emmc_rig.calibration.routes import calibrate
 from emmc_rig.calibration.shadow import Shadow, shadow_mask
 from emmc_rig.model.camera import build_imaging_matrix
@@ -184,6 +182,37 @@ def test_a_cause_is_named_only_for_whiteboards_where_it_is_far_outside_its_devia
         said = [*itertools.chain(*cause_lines(fit, boards, MASK))]
         assert len(said) == len(named)
         assert all(words in line for words, line in zip(named, said, strict=True))
+
+
+@pytest.mark.slow
+def test_the_noise_of_the_reference_is_that_of_all_whiteboards(design):
+    truth, rng = replace(designed_placement(CAMERA), blur_um=3.0), np.random.default_rng(5)
+    chosen = [labels(VIEWS).index(name) for name in ("clear", "vignetting")]
+    white2 = np.full(SIZE, 0.02**2, np.float32)
+    fits, alone = [], []
+    for seed in range(24):
+        darker = 1 - rng.normal(0, 0.02, SIZE)
+        boards = [
+            replace(
+                board,
+                reading=(board.reading * darker).astype(np.float32),
+                variance=board.variance + np.square(board.reading) * white2,
+            )
+            for board in synthetic(design, truth, seed=seed)
+        ]
+        for shared, found in ((white2, fits), (None, alone)):
+            each = [replace(board, white2=shared) for board in boards]
+            found.append(fit_placement(each, CAMERA, MASK, start=truth))
+    spread = np.std([fit.placement.vector()[chosen] for fit in fits], axis=0, ddof=1)
+    stated, of_own = (
+        np.mean([np.sqrt(np.diag(fit.covariance))[chosen] for fit in found], axis=0)
+        for found in (fits, alone)
+    )
+    # The deviation of 24 is known to 15 %.
+    assert np.all(np.abs(spread / stated - 1) < 0.35)
+    # The level is less sure than if every whiteboard had its own reference, a slope surer.
+    assert stated[0] > 1.2 * of_own[0]
+    assert stated[1] < 0.8 * of_own[1]
 
 
 def test_one_open_whiteboard_alone_leaves_the_aperture_to_the_design(design):
