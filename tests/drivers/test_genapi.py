@@ -7,11 +7,8 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from random import Random
 
 import pytest
-from fuzzing import fuzz
-from hypothesis import strategies as st
 
 from emmc_rig.drivers.errors import (
     CameraDescriptionError,
@@ -21,7 +18,6 @@ from emmc_rig.drivers.errors import (
     UsbGoneError,
 )
 from emmc_rig.drivers.genapi import Features
-from emmc_rig.simulators import u3v_description
 
 HEAD = (
     '<?xml version="1.0" encoding="utf-8"?><RegisterDescription ModelName="M" VendorName="V" '
@@ -240,40 +236,3 @@ def test_descriptions_of_real_cameras_are_followed(peer_files):
                 acts["values"] += 1
     assert acts["cameras"] > 40, acts
     assert acts["values"] > 30, acts
-
-
-SEEDS = st.integers(0, 1 << 62)
-XML = u3v_description.describe("M", ("BayerRG8", "BayerRG12p"), (20, 20_000), (0, 240))
-WORDS = (
-    *(b"Value", b"pValue", b"Formula", b"Address", b"Length", b"Width", b"WidthLimit", b"<", b">"),
-    *(b"0", b"0x", b"-1", b"99999999999999999999", b"ALL - OFF", b"TO", b"(", b"**", b"\xff", b""),
-)
-
-
-def damaged_xml(random):
-    raw = bytearray(XML)
-    for _ in range(random.randint(1, 6)):
-        at = random.randrange(len(raw))
-        raw[at : at + random.randint(0, 12)] = random.choice(WORDS)
-    return bytes(raw)
-
-
-@pytest.mark.slow
-def test_no_xml_makes_the_reader_fail_outside_the_drivers_errors():
-    names = ("Width", "ExposureTime", "Gain", "PixelFormat", "AcquisitionStart", "BlackLevel")
-
-    def check(seed):
-        random = Random(seed)
-        try:
-            found = Features(damaged_xml(random), Memory(random.randbytes(64)))
-        except DriverError:
-            return
-        for name in names:
-            for act in (found.value, found.limits, found.choices, found.is_writable, found.has):
-                with suppress(DriverError):
-                    act(name)
-            for value in (1, "On", 2.5):
-                with suppress(DriverError):
-                    found.set(name, value)
-
-    fuzz(check, SEEDS)

@@ -186,14 +186,6 @@ def test_one_bad_answer_while_it_moves_does_not_end_the_wait_early(in_memory, fa
         assert in_memory.true_um(axis) == pytest.approx(target_um, abs=TOLERANCE_UM)
 
 
-@pytest.mark.parametrize("fault", ["drop_reply", "garble_reply"])
-def test_a_lost_answer_on_any_wire_is_asked_for_again(simulated, fault):
-    stage, axis = homed(simulated)
-    here_um = stage.move_to_um({axis: middle_um(stage, axis)})[axis]
-    simulated.device.faults.inject(fault)
-    assert stage.position_um(axis) == pytest.approx(here_um, abs=TOLERANCE_UM)
-
-
 def test_a_move_that_never_reached_the_device_is_an_error_and_not_repeated(simulated):
     stage, axis = homed(simulated, approach_um=0.0)
     here_um = simulated.true_um(axis)

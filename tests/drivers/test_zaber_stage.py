@@ -23,7 +23,6 @@ from emmc_rig.drivers.stage import (
     Stage,
     StageSettings,
     move_time_limit_s,
-    needs_approach,
 )
 from emmc_rig.drivers.transport import SerialTransport
 from emmc_rig.drivers.zaber import ZaberStage, find_devices
@@ -144,16 +143,6 @@ def test_an_axis_the_device_does_not_have_shows_at_construction(bench):
     assert (caught.value.reply, caught.value.axis) == ("BADAXIS", "focus")
 
 
-def test_a_speed_setting_is_microsteps_per_second_times_1_6384():
-    slow = replace(SPEC, max_speed_um_s=100.0)
-    bench = Bench({(1, 1): slow})
-    stage = bench.stage(axes={"mask_x": (1, 1)})
-    stage.home()
-    start_s = bench.clock.now_s()
-    stage.move_to_um({"mask_x": 1000.0})
-    assert bench.clock.now_s() - start_s == pytest.approx(10.0, abs=0.15)
-
-
 def test_waiting_until_settled_outlasts_a_move_that_something_else_started(stage, bench):
     bench.chain.feed(b"/1 1 move abs 20000\n")
     stage.wait_until_settled(["mask_x"])
@@ -174,14 +163,6 @@ def test_a_reply_without_the_promised_checksum_is_not_believed(stage, bench):
     bench.chain.feed = lambda data: feed(data).partition(b":")[0] + b"\r\n"
     with pytest.raises(GarbledReplyError, match="missing"):
         stage.position_um("mask_x")
-
-
-@pytest.mark.parametrize(
-    ("start_um", "needed"),
-    [(0.0, False), (90.0, False), (90.1, True), (100.0, True), (500.0, True)],
-)
-def test_an_approach_is_needed_unless_the_move_ends_with_enough_upward_travel(start_um, needed):
-    assert needs_approach(start_um, 100.0, approach_um=10.0) is needed
 
 
 def test_a_tolerance_finer_than_half_a_microstep_is_refused(bench):
