@@ -105,6 +105,13 @@ def test_the_nearest_step_of_a_range_lies_within_it(target, taken):
     assert codec.nearest(described(span=(5, 95, 5)), target, frozenset()) == taken
 
 
+def test_a_property_that_is_no_number_is_refused():
+    with pytest.raises(CameraFormatError, match="are no numbers"):
+        codec.decode_description(HEARD_SHUTTER[:2] + b"\xff\xff" + HEARD_SHUTTER[4:])
+    with pytest.raises(CameraFormatError, match="longer than the data"):
+        codec.decode_handles(b"\xff" * 8)
+
+
 def test_a_property_without_a_form_can_be_what_it_is():
     assert codec.limits(described(), frozenset()) == (100, 100)
 

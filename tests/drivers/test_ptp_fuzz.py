@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from fuzzing import errors_of_the_driver_allowed, fuzz
+from fuzzing import damage, errors_of_the_driver_allowed, fuzz
 from hypothesis import strategies as st
 
 from emmc_rig.drivers import ptp_codec as codec
@@ -26,26 +26,6 @@ DNG = encode_dng(MOSAIC, "rggb", 64, 4095, 0.01)
 PACKET = 64
 MOST_TRANSFERS = 100_000
 """More than any honest session takes by far: beyond it the driver is caught in a loop."""
-
-
-def damage(data, seed):
-    """Return the bytes with a few of them changed, lost, doubled or added."""
-    generator = random.Random(seed)
-    damaged = bytearray(data)
-    for _ in range(generator.randrange(1, 5)):
-        at = generator.randrange(len(damaged) + 1)
-        match generator.randrange(5):
-            case 0 if at < len(damaged):
-                damaged[at] = generator.choice((0, 1, 0x7F, 0x80, 0xFF, generator.randrange(256)))
-            case 1:
-                del damaged[at : at + generator.randrange(1, 9)]
-            case 2:
-                damaged[at:at] = generator.randbytes(generator.randrange(1, 9))
-            case 3:
-                damaged[at:at] = damaged[at : at + 16]
-            case _:
-                del damaged[at:]
-    return bytes(damaged)
 
 
 def check_raw(seed):

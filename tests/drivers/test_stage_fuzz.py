@@ -7,7 +7,7 @@ import random
 import re
 
 import pytest
-from fuzzing import DRIVER_CASES, FUZZ, errors_of_the_driver_allowed, fuzz
+from fuzzing import DRIVER_CASES, FUZZ, damage, errors_of_the_driver_allowed, fuzz
 from hypothesis import strategies as st
 
 from emmc_rig.drivers import apt_codec
@@ -57,21 +57,6 @@ PARTS = DRIVER_CASES // 4
 """A whole driver answers in the time of many codec calls."""
 
 
-def edited(message, edits):
-    data = bytearray(message)
-    for kind, place, value in edits:
-        place %= max(1, len(data))
-        if kind == "c" and data:
-            data[place] = value
-        elif kind == "l":
-            del data[place : place + 1]
-        elif kind == "i":
-            data.insert(place, value)
-        elif data:
-            data.insert(place, data[place])
-    return bytes(data)
-
-
 class Liar:
     """Firmware whose answers pass through hands that spoil them."""
 
@@ -108,11 +93,7 @@ class Liar:
         elif mood == "r":  # random bytes
             answer = self.random.randbytes(self.random.randrange(60))
         elif mood == "s":  # spoilt
-            edits = [
-                (self.random.choice("clid"), self.random.randrange(200), self.random.randrange(256))
-                for _ in range(self.random.randrange(1, 4))
-            ]
-            answer = edited(answer, edits)
+            answer = damage(answer, self.random.random())
         elif mood == "o":  # an older answer
             answer = self._old
         elif mood == "d":  # twice
