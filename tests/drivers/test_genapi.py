@@ -1,7 +1,6 @@
 """GenICam features by EMVA's library: refusals before anything is sent, values from no cache."""
 
 import lzma
-import struct
 import sys
 import time
 from collections import Counter
@@ -58,24 +57,6 @@ def register(name="R", kind="IntReg", address=0, length=4, more="", order="Littl
 RAMP = bytes(range(1, 65))
 
 
-CONVERTED = (
-    '<Float Name="F"><pValue>C</pValue><Unit>us</Unit></Float>'
-    '<Converter Name="C"><FormulaTo>ROUND(FROM * 10)</FormulaTo>'
-    "<FormulaFrom>TO / 10</FormulaFrom><pValue>I</pValue></Converter>"
-    '<Integer Name="I"><pValue>R</pValue><Min>5</Min><Max>1000</Max></Integer>' + register()
-)
-
-
-def test_a_converter_works_both_ways_and_converts_the_limits():
-    memory = Memory(struct.pack("<I", 25) + bytes(60))
-    found = features(CONVERTED, memory)
-    assert found.value("F") == 2.5
-    assert found.limits("F") == (0.5, 100.0)
-    assert found.unit("F") == "us"
-    found.set("F", 7.34)
-    assert struct.unpack_from("<I", memory.data) == (73,)
-
-
 CHOICE = (
     '<Enumeration Name="E"><pIsLocked>Lock</pIsLocked>'
     '<EnumEntry Name="Off"><Value>0</Value></EnumEntry>'
@@ -108,13 +89,6 @@ def test_a_locked_feature_is_not_written():
     assert not found.is_writable("E")
     with pytest.raises(CameraSettingError, match="cannot be changed now"):
         found.set("E", "On")
-
-
-def test_a_command_stores_its_value():
-    memory = Memory()
-    body = '<Command Name="Go"><pValue>R</pValue><CommandValue>7</CommandValue></Command>'
-    features(body + register(), memory).execute("Go")
-    assert memory.data[0] == 7
 
 
 def test_a_number_outside_its_limits_or_steps_is_refused_before_anything_is_sent():

@@ -54,6 +54,11 @@ def test_an_axis_is_really_where_it_reads_to_be_from_either_side(simulated):
             assert simulated.true_um(axis) == pytest.approx(um, abs=TOLERANCE_UM)
 
 
+def test_a_tolerance_finer_than_half_a_step_is_refused(in_memory):
+    with pytest.raises(ValueError, match="loosen it"):
+        in_memory.make_stage(tolerance_um=0.01)
+
+
 def test_without_the_approach_a_downward_move_is_off_by_the_backlash(simulated):
     stage, axis = homed(simulated, approach_um=0.0)
     target_um = middle_um(stage, axis)

@@ -13,7 +13,6 @@ import usb.core
 from fuzzing import fuzz
 from hypothesis import strategies as st
 
-from emmc_rig.bench.hardware import open_camera
 from emmc_rig.drivers import u3v_codec as codec
 from emmc_rig.drivers.errors import (
     CameraBusyError,
@@ -111,11 +110,6 @@ def test_a_camera_is_listed_and_says_who_made_it(bench):
 
 def test_a_camera_tells_its_temperature(bench):
     assert bench.open().temperatures_c() == {"DeviceTemperature": 38.5}
-
-
-def test_a_camera_is_opened_by_its_name_on_the_command_line(bench):
-    camera = open_camera("u3v:U1", bench.clock, bench.bus)
-    np.testing.assert_array_equal(camera.snap().mosaic, MOSAIC)
 
 
 def test_exposure_and_gain_are_what_the_camera_took(bench):

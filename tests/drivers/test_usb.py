@@ -181,10 +181,6 @@ def test_a_device_that_takes_nothing_is_a_timeout_that_says_how_far_it_came(cloc
     assert caught.value.done == 0
 
 
-def test_a_control_request_is_answered(bus):
-    assert open_device(KIND, backend=bus).control(0xA1, 7, 8, 9, 64) == bytes((7, 8, 9))
-
-
 def test_a_stall_lasts_until_it_is_cleared(bus, echo):
     echo.messages = [StallError(), b"again"]
     _, _, pipe = pipes(bus)

@@ -100,11 +100,17 @@ def test_the_lamp_colour_lights_its_own_pixels_only():
     assert not readings[1::2, ::2].any()
 
 
-def test_a_misplaced_mask_reads_as_the_imaging_matrix_of_a_moved_one():
+@pytest.mark.parametrize(
+    ("at_um", "errors"),
+    [
+        (OPEN, MountingErrors((30.0, -17.0), 0.0, 1.0)),
+        ({**OPEN, "mask_x": 30.0, "mask_y": -17.0}, NO_ERRORS),
+    ],
+)
+def test_a_misplaced_mask_and_one_that_the_stage_moved_read_as_the_imaging_matrix(at_um, errors):
     camera = coded(shots=[{"offset_um": {"code": [30.0, -17.0]}}])
     expected = build_imaging_matrix(camera, SIZE).forward(light_field())[0]
-    misplaced = MountingErrors((30.0, -17.0), 0.0, 1.0)
-    found = bench_for(camera, light_field(), OPEN, misplaced).readings()
+    found = bench_for(camera, light_field(), at_um, errors).readings()
     assert relative_error(found, expected) < 3e-3
 
 
@@ -148,13 +154,6 @@ def test_out_of_focus_every_view_moves_by_its_steps_from_the_middle(finer, focus
     found = bench_for(camera, scene, {**OPEN, "focus": focus_um}).readings()
     expected = bench_for(camera, moved, OPEN).readings()
     np.testing.assert_allclose(found[2:-2, 2:-2], expected[2:-2, 2:-2], rtol=1e-5)
-
-
-def test_the_stage_moves_the_mask_as_an_offset_does():
-    camera = coded(shots=[{"offset_um": {"code": [60.0, 20.0]}}])
-    expected = build_imaging_matrix(camera, SIZE).forward(light_field())[0]
-    at_um = {**OPEN, "mask_x": 60.0, "mask_y": 20.0}
-    assert relative_error(bench_for(camera, light_field(), at_um).readings(), expected) < 3e-3
 
 
 def test_a_finer_scene_whose_blocks_average_to_the_light_field_reads_nearly_the_same():
