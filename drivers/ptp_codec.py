@@ -168,7 +168,7 @@ def decode_message(data: bytes) -> Message:
 
 
 NUMBERS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "q", 8: "Q"}
-"""Data types of property values: texts and lists are none of those that are read here."""
+"""Data types of property values that are read here: no texts, no lists."""
 
 U16 = Annotated[int, "H"]
 U32 = Annotated[int, "I"]

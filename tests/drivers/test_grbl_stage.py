@@ -243,6 +243,15 @@ def test_a_reset_while_it_moves_is_a_lost_position(bench, monkeypatch):
     assert not stage.is_homed("x")
 
 
+def test_a_restart_that_nobody_asked_for_is_a_lost_position(bench):
+    stage = bench.homed()
+    bench.device.power_cycle()
+    with pytest.raises(LostPositionError, match="restarted"):
+        stage.position_um("x")
+    with pytest.raises(NotHomedError):
+        stage.position_um("y")
+
+
 def test_homing_that_is_switched_off_is_refused_with_what_to_do():
     bench = Bench(settings={codec.HOMING: 0})
     stage = bench.stage()

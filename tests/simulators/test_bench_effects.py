@@ -246,6 +246,13 @@ def test_pixels_differ_in_response_and_black_and_rows_in_their_noise():
     assert rows.mean(axis=0).std() < 5
 
 
+def test_filters_pass_their_share_of_the_neighbouring_colours_and_open_pixels_all():
+    mixed = SensorFlaws(crosstalk=0.1).mixed(np.eye(3, dtype=np.float32))
+    np.testing.assert_allclose(mixed, [[0.9, 0.1, 0], [0.05, 0.9, 0.05], [0, 0.1, 0.9]])
+    white = np.ones((1, 3), np.float32)
+    np.testing.assert_array_equal(SensorFlaws(crosstalk=0.1).mixed(white), white)
+
+
 def test_a_board_out_of_focus_is_seen_shifted_by_its_parallax():
     seen = BoardFlaws(place_spread=0.2, parallax_px=3.0).radiance((12, 18), (5, 5), 0.0)
     np.testing.assert_allclose(seen[4, 2, :-3], seen[2, 2, 3:], rtol=1e-6)

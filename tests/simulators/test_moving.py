@@ -1,4 +1,4 @@
-"""Scenes that move: what is rendered at a time against worlds that stand where it is then."""
+"""Scenes that move: renderings at a time, compared with renderings of worlds that stand still."""
 
 import numpy as np
 from smooth_texture import SMOOTH, UNLIT
