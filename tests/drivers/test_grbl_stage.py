@@ -22,7 +22,7 @@ from emmc_rig.drivers.errors import (
     PressedSwitchError,
     TransportTimeoutError,
 )
-from emmc_rig.drivers.grbl import GrblStage
+from emmc_rig.drivers.grbl import GrblStage, identify
 from emmc_rig.drivers.stage import DEFAULT_SETTINGS, Direction, Reading, StageSettings
 from emmc_rig.simulators.clock import ManualClock
 from emmc_rig.simulators.grbl import BENCH_AXES, WITH_SINGLE_AXIS_HOMING, GrblController
@@ -396,3 +396,7 @@ def test_an_axis_that_the_controller_does_not_have_shows_at_construction():
         two.stage({"focus": "Z"})
     with pytest.raises(ValueError, match="use one of X, Y"):
         two.stage({"focus": "Q"})
+
+
+def test_it_says_what_it_is(bench):
+    assert identify(bench.transport, bench.clock) == ("version 1.1h.20190825:, options V,15,128")

@@ -99,6 +99,9 @@ def homed_zaber(zaber):
         ("1 0 18 get system.axiscount", "@01 0 18 OK IDLE WR 2"),
         ("1 1 19 get limit.max", "@01 1 19 OK IDLE WR 200000"),
         ("1 1 20 move abs 8000", "@01 1 20 OK BUSY -- 0"),
+        ("1 1 21 set resolution 257", "@01 1 21 RJ IDLE WR BADDATA"),
+        # `maxspeed` ends at 16384 times the resolution, 64.
+        ("1 1 22 set maxspeed 1048577", "@01 1 22 RJ IDLE WR BADDATA"),
     ],
 )  # fmt: skip
 def test_zaber_replies_are_formatted_as_the_manual_says(zaber, command, reply):
