@@ -8,16 +8,13 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from itertools import pairwise, zip_longest
 
 HIGHEST_NUMBERS = (9_999, 99_999, 999_999)
 """After these the counters of cameras begin again, at 0 or 1."""
 DELETED = 10
 """Frames that may be missing at either end of the counter."""
-CLOCK_CHANGE = timedelta(hours=1)
-LONGEST_PAUSE = timedelta(minutes=10)
-"""Between two files of a sequence, at a change of the clock, or three times its other pauses."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +49,6 @@ def capture_order(names: Sequence[str], times: Sequence[datetime | None]) -> Cap
     if len(known) < len(names):
         missing = next(name for name, at in zip(named, stated, strict=True) if at is None)
         notes.append(f"{what}, but {missing} states none: ordered by name")
-    elif not known[0][1].tzinfo and _clock_was_set_back([at for _, at in known]):
-        notes.append(f"{what}, as at the end of summer time: ordered by name")
     else:
         ranks = sorted(range(len(known)), key=lambda rank: (known[rank][1], rank))
         return CaptureOrder(
@@ -61,15 +56,6 @@ def capture_order(names: Sequence[str], times: Sequence[datetime | None]) -> Cap
             (f"{what}: ordered by time, not by name",),
         )
     return CaptureOrder(tuple(by_name), tuple(notes))
-
-
-def _clock_was_set_back(times: Sequence[datetime]) -> bool:
-    """Return whether times run on but for one step back, by about an hour."""
-    steps = [later - earlier for earlier, later in pairwise(times)]
-    back = [step for step in steps if step < timedelta(0)]
-    pause = max((step for step in steps if step not in back), default=timedelta(0))
-    longest = max(3 * pause, LONGEST_PAUSE)
-    return len(back) == 1 and timedelta(0) <= back[0] + CLOCK_CHANGE <= longest
 
 
 def natural(name: str) -> list[tuple[int, str]]:

@@ -207,25 +207,24 @@ class PtpSession:
             return None
         return codec.decode_description(self.fetch(Operation.GET_PROPERTY_DESCRIPTION, code))
 
-    def read(self, described: codec.PropertyDescription) -> codec.Value:
+    def read(self, described: codec.PropertyDescription) -> int:
         """Return a property's present value."""
         data = self.fetch(Operation.GET_PROPERTY, described.code)
         return codec.decode_value(described.data_type, data)
 
-    def write(self, described: codec.PropertyDescription, value: codec.Value) -> codec.Value:
+    def write(self, described: codec.PropertyDescription, value: int) -> int:
         """Set a property and return what the camera made of it."""
         data = codec.encode_value(described.data_type, value)
         self.request(Operation.SET_PROPERTY, described.code, data=data)
         return self.read(described)
 
     def capture(
-        self, exposure_s: float, accept: Callable[[ObjectInfo], bool], all_of_it: bool = False
-    ) -> Taken:
-        """Release the shutter and return the first new object that is accepted.
+        self, exposure_s: float, accept: Callable[[ObjectInfo], bool]
+    ) -> tuple[int, ObjectInfo]:
+        """Release the shutter and return handle and info of the first new object that is accepted.
 
         Folders are passed over. An event that never comes is made up for by looking at the card.
-        `all_of_it`: wait for the camera's CaptureComplete, and so for the other files of the same
-        exposure. Raises `CaptureError`, `CardFullError`, or as `request` does.
+        Raises `CaptureError`, `CardFullError`, or as `request` does.
         """
         with self.lock:
             self._forget_events()
@@ -233,7 +232,7 @@ class PtpSession:
             self._stop_wanted.clear()
             self.request(Operation.INITIATE_CAPTURE, 0, 0)
             self._picture_pending = True
-            taken = self._await_objects(seen, self._transaction, exposure_s, accept, all_of_it)
+            taken = self._await_object(seen, self._transaction, exposure_s, accept)
             self._picture_pending = False
             return taken
 
@@ -328,21 +327,18 @@ class PtpSession:
             if self._transport.event(wait_s) is None:
                 return
 
-    def _await_objects(
+    def _await_object(
         self,
         seen: set[int],
         transaction: int,
         exposure_s: float,
         accept: Callable[[ObjectInfo], bool],
-        all_of_it: bool,
-    ) -> Taken:
+    ) -> tuple[int, ObjectInfo]:
         settings, clock = self.settings, self.clock
         exposed_s = clock.now_s() + min(exposure_s, LONGEST_EXPOSURE_S)
         deadline_s = exposed_s + settings.capture_limit_s
-        found: tuple[int, ObjectInfo] | None = None
-        others: list[tuple[int, ObjectInfo]] = []
-        done = False
-        while (now_s := clock.now_s()) < deadline_s and not (found and (done or not all_of_it)):
+        others: list[str] = []
+        while (now_s := clock.now_s()) < deadline_s:
             if self._stop_wanted.is_set() and now_s < exposed_s:
                 # Device Reset Request: the camera becomes idle (USB Still Image Capture, 5.2.3).
                 self._transport.reset()
@@ -359,11 +355,9 @@ class PtpSession:
                 info = self.object_info(handle)
                 if info.format == Format.FOLDER:
                     continue
-                if found is None and accept(info):
-                    found = handle, info
-                    deadline_s = min(deadline_s, clock.now_s() + settings.pair_limit_s)
-                else:
-                    others.append((handle, info))
+                if accept(info):
+                    return handle, info
+                others.append(info.name)
             if event is None:
                 continue
             if event.code == EventCode.STORE_FULL:
@@ -373,15 +367,12 @@ class PtpSession:
                 transaction,
                 codec.EVERYTHING,
             ):
-                done = True
                 grace_s = settings.pair_limit_s
                 deadline_s = min(deadline_s, max(clock.now_s(), exposed_s) + grace_s)
-        if found is not None:
-            return Taken(*found, tuple(others))
         if others:
-            names = ", ".join(info.name for _, info in others)
             raise CaptureError(
-                f"the camera gave {names}", "set its image quality to RAW, or RAW with JPEG"
+                f"the camera gave {', '.join(others)}",
+                "set its image quality to RAW, or RAW with JPEG",
             )
         raise CaptureError(
             f"nothing new on the card after {clock.now_s() - exposed_s + exposure_s:.3g} s",
@@ -397,15 +388,6 @@ class PtpSession:
         if event.code == EventCode.OBJECT_ADDED and event.parameters:
             return [handle for handle in event.parameters[:1] if handle not in seen]
         return []
-
-
-@dataclass(frozen=True)
-class Taken:
-    """A new object on the card, and the others of the same exposure."""
-
-    handle: int
-    info: ObjectInfo
-    others: tuple[tuple[int, ObjectInfo], ...] = ()
 
 
 def is_raw(info: ObjectInfo) -> bool:
@@ -429,7 +411,7 @@ class Dial:
     def value(self) -> float | None:
         """What it is; None where the camera does not say, or it is automatic."""
         now = self._now
-        if not isinstance(now, int) or now <= 0 or now in self._special:
+        if now is None or now <= 0 or now in self._special:
             return None
         return now * self._unit
 
@@ -458,7 +440,7 @@ class PtpCamera(ShapeFromFrames):
 
     PTP does not state how large a RAW frame is: where `shape` is not given, asking for it before
     the first frame exposes one. Every frame must have that shape and its colours. `from_card`:
-    delete each picture from the card once it has arrived; otherwise the card fills up.
+    delete each RAW file from the card once it has arrived; otherwise the card fills up.
     `on_progress` gets the bytes of a picture done and in all.
     """
 
@@ -520,22 +502,15 @@ class PtpCamera(ShapeFromFrames):
             return self.gain, self.gain
         return limits[0] / self._base_iso, limits[1] / self._base_iso
 
-    @property
-    def battery_percent(self) -> float | None:
-        """Charge of the battery, None where the camera does not say."""
-        described = self.session.describe(Property.BATTERY_LEVEL)
-        value = described.current if described is not None else None
-        return value if isinstance(value, int) and value > 0 else None
-
     def details(self) -> dict[str, str]:
         """Return what else the camera says of itself, by name."""
-        battery = self.battery_percent
+        battery = self.session.describe(Property.BATTERY_LEVEL)
         cards = ", ".join(
             f"{card.free_bytes / 1e9:.3g} of {card.capacity_bytes / 1e9:.3g} GB free"
             for card in self.session.storages()
         )
         return {
-            "battery": "not reported" if battery is None else f"{battery:g} %",
+            "battery": f"{battery.current} %" if battery and battery.current else "not reported",
             "cards": cards or "none",
         }
 
@@ -563,14 +538,12 @@ class PtpCamera(ShapeFromFrames):
         session = self.session
         with session.lock:
             exposure_s = self._exposure.value
-            taken = session.capture(exposure_s or 0.0, is_raw, all_of_it=self._from_card)
-            data = session.download(taken.handle, taken.info, self.on_progress)
-            arrived_s = session.clock.now_s()
-            frame = self._decoded(taken.info.name, data, exposure_s, self.gain, arrived_s)
+            handle, info = session.capture(exposure_s or 0.0, is_raw)
+            data = session.download(handle, info, self.on_progress)
+            frame = self._decoded(info.name, data, exposure_s, self.gain, session.clock.now_s())
             if self._from_card:
-                for handle in (taken.handle, *(other for other, _ in taken.others)):
-                    session.request(Operation.DELETE_OBJECT, handle, 0)
-        return replace(frame, camera_time_s=_camera_time_s(taken.info.captured))
+                session.request(Operation.DELETE_OBJECT, handle, 0)
+        return replace(frame, camera_time_s=_camera_time_s(info.captured))
 
     def stop_exposure(self) -> bool:
         """Break off the exposure under way, within half a second; any thread may call.

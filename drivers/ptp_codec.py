@@ -168,11 +168,8 @@ def decode_message(data: bytes) -> Message:
 
 
 NUMBERS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "q", 8: "Q"}
-"""Data types of property values; with `ARRAY` set, many of them."""
-ARRAY = 0x4000
-TEXT = 0xFFFF
+"""Data types of property values that are read here: no texts, no lists."""
 
-Value = int | str | tuple[int, ...]
 U16 = Annotated[int, "H"]
 U32 = Annotated[int, "I"]
 U64 = Annotated[int, "Q"]
@@ -211,13 +208,11 @@ class _Reader:
         raw = bytes(self.take(f"{size}B"))
         return raw.decode("utf-16-le", "replace").partition("\x00")[0]
 
-    def value(self, data_type: int) -> Value:
-        if data_type == TEXT:
-            return self.text()
-        layout = NUMBERS.get(data_type & ~ARRAY)
+    def value(self, data_type: int) -> int:
+        layout = NUMBERS.get(data_type)
         if layout is None:
-            raise CameraFormatError(self._data, f"values of type {data_type:#06x} are not known")
-        return self.array(layout) if data_type & ARRAY else self.number(layout)
+            raise CameraFormatError(self._data, f"values of type {data_type:#06x} are no numbers")
+        return self.number(layout)
 
 
 def encode_text(text: str) -> bytes:
@@ -234,22 +229,15 @@ def _encode_array(layout: str, values: tuple[int, ...]) -> bytes:
     return struct.pack(f"<I{len(values)}{layout}", len(values), *values)
 
 
-def encode_value(data_type: int, value: Value) -> bytes:
+def encode_value(data_type: int, value: int) -> bytes:
     """Return a property's value; raises `ValueError` where value and type do not match."""
-    if data_type == TEXT:
-        return encode_text(str(value))
-    layout = NUMBERS.get(data_type & ~ARRAY)
-    if layout is None:
-        raise ValueError(f"values of type {data_type:#06x} are not known")
     try:
-        if isinstance(value, tuple):
-            return _encode_array(layout, value)
-        return struct.pack("<" + layout, value)
+        return struct.pack("<" + NUMBERS[data_type], value)
     except struct.error as error:
         raise ValueError(f"{value!r} is no value of type {data_type:#06x}") from error
 
 
-def decode_value(data_type: int, data: bytes) -> Value:
+def decode_value(data_type: int, data: bytes) -> int:
     """Return a property's value; raises `CameraFormatError`."""
     return _Reader(data).value(data_type)
 
@@ -370,9 +358,9 @@ class PropertyDescription:
     code: int
     data_type: int
     writable: bool
-    default: Value
-    current: Value
-    choices: tuple[Value, ...] = ()
+    default: int
+    current: int
+    choices: tuple[int, ...] = ()
     span: tuple[int, int, int] | None = None
 
 
@@ -404,13 +392,10 @@ def decode_description(data: bytes) -> PropertyDescription:
     code, data_type, writable = reader.take("HHB")
     default, current = reader.value(data_type), reader.value(data_type)
     form = reader.number("B")
-    choices: tuple[Value, ...] = ()
+    choices: tuple[int, ...] = ()
     span = None
     if form == SPAN_FORM:
-        low, high, step = (reader.value(data_type) for _ in range(3))
-        if not (isinstance(low, int) and isinstance(high, int) and isinstance(step, int)):
-            raise CameraFormatError(data, "a range of texts or lists")
-        span = low, high, step
+        span = reader.value(data_type), reader.value(data_type), reader.value(data_type)
     elif form == CHOICES_FORM:
         choices = tuple(reader.value(data_type) for _ in range(reader.number("H")))
     return PropertyDescription(code, data_type, bool(writable), default, current, choices, span)
@@ -418,9 +403,7 @@ def decode_description(data: bytes) -> PropertyDescription:
 
 def numeric_choices(described: PropertyDescription, special: frozenset[int]) -> tuple[int, ...]:
     """Return the positive numbers among the choices, in order, but for the special ones."""
-    return tuple(
-        sorted({v for v in described.choices if isinstance(v, int) and v > 0 and v not in special})
-    )
+    return tuple(sorted({v for v in described.choices if v > 0 and v not in special}))
 
 
 def nearest(described: PropertyDescription, target: float, special: frozenset[int]) -> int:
@@ -444,6 +427,6 @@ def limits(described: PropertyDescription, special: frozenset[int]) -> tuple[int
     choices = numeric_choices(described, special)
     if not choices and described.span is not None:
         return max(1, described.span[0]), max(1, described.span[1])
-    if not choices and isinstance(described.current, int):
+    if not choices:
         choices = (max(1, described.current),)
-    return (choices[0], choices[-1]) if choices else (1, 1)
+    return choices[0], choices[-1]

@@ -45,8 +45,7 @@ class OpticsFlaws:
     deviation of the area of the hole before every view; plate_turn_deg: of the pinhole plate and
     its stage about the axis, x to y. creep_um_per_s: of the mask, in x. warming_um: by which the
     lens gets farther from the sensor, with WARM_UP_S.
-    standard deviation of the mask's edges in red, green and blue light. pupil: what the real lens
-    leaves open; None: what the camera describes.
+    pupil: what the real lens leaves open; None: what the camera describes.
     """
 
     aperture_spread: float = 0.0

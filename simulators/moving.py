@@ -1,8 +1,7 @@
-"""Worlds that move: where everything is at a time, and the exact optical flow between two times.
+"""Worlds that move: where everything is at a time.
 
 Every object is moved by an affine map of (S, T, D), D as quoted, from its place at time 0. A flat
-card stays flat under it; a ball stays a ball, whose centre moves as the map says. Each point of an
-object is so known at any time, and its flow needs no estimate.
+card stays flat under it; a ball stays a ball, whose centre moves as the map says.
 """
 
 from __future__ import annotations
@@ -18,14 +17,9 @@ from emmc_rig.simulators.raycaster import (
     Ball,
     Card,
     World,
-    pixel_centres,
-    surfaces,
-    tabulated,
 )
 
 Array = NDArray[np.float64]
-_SAME_D = 1e-6
-"""Widths per aperture by which a point that was followed may lie off the surface seen there."""
 
 
 def world_at(world: World, time_s: float) -> World:
@@ -35,29 +29,6 @@ def world_at(world: World, time_s: float) -> World:
         cards=tuple(moved_card(card, _map_of(card, world, time_s)) for card in world.cards),
         balls=tuple(_moved_ball(b, _map_of(b, world, time_s), time_s) for b in world.balls),
     )
-
-
-def flow_between(world: World, size: tuple[int, int], from_s: float, to_s: float) -> Array:
-    """Return where each point that the central view sees goes, (y, x, 2): right and down, pixels.
-
-    NaN where there is no surface at the first time, and where the point is hidden, or beside the
-    picture, at the second. A point's surface is the first one that is at least half opaque, as for
-    disparities.
-    """
-    height, width = size
-    before, after = (tabulated(world_at(world, time_s)) for time_s in (from_s, to_s))
-    points = pixel_centres(size)
-    d, objects = surfaces(points, 0.0, 0.0, before)
-    moved = np.concatenate([points, d[..., np.newaxis] / QUOTED, np.ones((*size, 1))], axis=-1)
-    for place, thing in enumerate((*world.cards, *world.balls)):
-        there = objects == place
-        move = _map_of(thing, world, to_s) @ np.linalg.inv(_map_of(thing, world, from_s))
-        moved[there] = moved[there] @ move.T
-    ends, ends_d = moved[..., :2], moved[..., 2] * QUOTED
-    seen_d, seen_objects = surfaces(ends, 0.0, 0.0, after)
-    shown = (objects >= 0) & (seen_objects == objects) & (np.abs(seen_d - ends_d) < _SAME_D)
-    shown &= (np.abs(ends) < np.array([0.5, height / width / 2])).all(axis=-1)
-    return np.where(shown[..., np.newaxis], (ends - points) * width, np.nan)
 
 
 def _map_of(thing: Card | Ball, world: World, time_s: float) -> Array:

@@ -328,7 +328,6 @@ class PtpCameraSimulator:
             value = decode_value(described.data_type, data)
         except CameraFormatError:
             return Answer(Code.INVALID_PROPERTY_FORMAT)
-        assert isinstance(value, int)
         span = described.span
         if value not in described.choices and not (span and span[0] <= value <= span[1]):
             return Answer(Code.INVALID_PROPERTY_VALUE)

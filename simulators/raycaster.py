@@ -161,7 +161,7 @@ class Tables:
 
 
 def tabulated(world: World) -> Tables:
-    """Lay out a world for `paint_view` and `surfaces`."""
+    """Lay out a world for `paint_view` and `first_surfaces`."""
     pool: dict[int, tuple[int, int]] = {}
     texels: list[np.ndarray] = []
 
@@ -204,26 +204,15 @@ def paint_view(view: np.ndarray, a_s: float, a_t: float, tables: Tables) -> None
     _trace_colours(view, a_s, a_t, *_kernel_arguments(a_s, a_t, tables))
 
 
-def pixel_centres(size: tuple[int, int]) -> np.ndarray:
-    """Return the centres (y, x, X and Y) of a view's pixels, in widths from its middle."""
-    height, width = size
-    y, x = np.indices(size)
-    return np.stack([(x + 0.5) / width - 0.5, (y + 0.5 - height / 2) / width], axis=-1)
+def first_surfaces(size: tuple[int, int], a_s: float, a_t: float, tables: Tables) -> np.ndarray:
+    """Return D, in widths per aperture, of what is seen at the centres of a view's pixels: (y, x).
 
-
-def surfaces(
-    points: np.ndarray, a_s: float, a_t: float, tables: Tables
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return what is seen at points (..., X and Y) of a view: D, and which object, as (...).
-
-    D is that of the first surface that is at least half opaque, in widths per aperture, 0 where
-    there is none; a ball counts as opaque. Objects: cards by their place in the tables, then balls;
-    -1 where there is no surface.
+    It is that of the first surface that is at least half opaque, a ball always; 0 where there is
+    none.
     """
-    flat = np.ascontiguousarray(points, np.float64).reshape(-1, 2)
-    d, objects = np.empty(len(flat)), np.empty(len(flat), np.int64)
-    _trace_surfaces(flat, d, objects, a_s, a_t, *_kernel_arguments(a_s, a_t, tables))
-    return d.reshape(points.shape[:-1]), objects.reshape(points.shape[:-1])
+    d = np.zeros(size)
+    _trace_surfaces(d, a_s, a_t, *_kernel_arguments(a_s, a_t, tables))
+    return d
 
 
 def _kernel_arguments(a_s: float, a_t: float, tables: Tables) -> tuple:
@@ -505,26 +494,28 @@ def _trace_colours(
 
 @_kernel
 def _trace_surfaces(
-    points, d, objects, a_s, a_t, card_windows, ball_windows,
+    d, a_s, a_t, card_windows, ball_windows,
     cards, balls, texels, around, around_side, lighting,
 ):  # fmt: skip
-    """Fill D and object of the first surface at points (point, 2) that is at least half opaque."""
-    for i in range(points.shape[0]):
-        x, y = points[i]
-        start = -_START_D
-        d[i], objects[i] = 0.0, _MISSED
-        for _ in range(_MAX_SURFACES):
-            k, found = _nearest(
-                x, y, 0.0, a_s, a_t, -1.0, start, True, card_windows, ball_windows, cards, balls
-            )
-            if found == _MISSED:
+    """Fill D (y, x) of the first surface at each pixel's centre that is at least half opaque."""
+    height, width = d.shape
+    for row in range(height):
+        for column in range(width):
+            x = (column + 0.5) / width - 0.5
+            y = (row + 0.5 - height / 2) / width
+            start = -_START_D
+            for _ in range(_MAX_SURFACES):
+                k, found = _nearest(
+                    x, y, 0.0, a_s, a_t, -1.0, start, True, card_windows, ball_windows, cards, balls
+                )
+                if found == _MISSED:
+                    break
+                if found < cards.size:
+                    card = cards[found]
+                    p, q = _on_card(card, x + k * a_s, y + k * a_t)
+                    alpha = _texel(texels, card.offset, card.side, p, q, card.tiled)[3]
+                    if alpha < 0.5:
+                        start = k + 1e-9
+                        continue
+                d[row, column] = -k
                 break
-            if found < cards.size:
-                card = cards[found]
-                p, q = _on_card(card, x + k * a_s, y + k * a_t)
-                alpha = _texel(texels, card.offset, card.side, p, q, card.tiled)[3]
-                if alpha < 0.5:
-                    start = k + 1e-9
-                    continue
-            d[i], objects[i] = -k, found
-            break

@@ -1,6 +1,6 @@
 """Built-in procedural scenes: seeded light fields with known disparity, on any grid of views.
 
-Those of `MOVING_SCENES` move: they are known at any time, with their exact optical flow.
+Those of `MOVING_SCENES` move: they are known at any time.
 
 Coordinates and disparities are those of `simulators.raycaster`: `Scene.disparity_px` quotes
 pixels per view step of 5 views of 256 columns. S runs from -1/2 to 1/2 across the picture, T
@@ -17,7 +17,7 @@ import numpy as np
 
 from emmc_rig.model.errors import SceneError, did_you_mean
 from emmc_rig.simulators import textures
-from emmc_rig.simulators.moving import flow_between, world_at
+from emmc_rig.simulators.moving import world_at
 from emmc_rig.simulators.raycaster import (
     Ball,
     CameraMotion,
@@ -25,9 +25,8 @@ from emmc_rig.simulators.raycaster import (
     Motion,
     Tables,
     World,
+    first_surfaces,
     paint_view,
-    pixel_centres,
-    surfaces,
     tabulated,
 )
 
@@ -51,7 +50,7 @@ class RenderedScene:
         views, size = self.light_field.shape[:2], self.light_field.shape[2:4]
         steps = max(views)
         a_t, a_s = ((n // 2 - (n - 1) / 2) / steps for n in views)
-        d, _ = surfaces(pixel_centres(size), a_s, a_t, self.tables)
+        d = first_surfaces(size, a_s, a_t, self.tables)
         return (d * (size[1] / steps)).astype(np.float32)
 
 
@@ -92,23 +91,6 @@ def render(
     if change is None:
         return rendered(_tables(name, seed, time_s), views, size)
     return rendered(tabulated(world_at(change(_world(name, seed)), time_s)), views, size)
-
-
-def flow_px(name: str, size: tuple[int, int], seed: int, from_s: float, to_s: float) -> np.ndarray:
-    """Return the exact optical flow of the centre view of an odd count of views.
-
-    The scene point at each pixel's centre is followed from the first time to the second, without
-    an estimate.
-
-    Returns:
-        (y, x, 2) float64, pixels to the right and downwards; NaN where that point is hidden at the
-        other time, or beside the picture.
-
-    Raises:
-        SceneError: as `render`.
-    """
-    _check(name, (1, 1), size, seed)
-    return flow_between(_world(name, seed), size, from_s, to_s)
 
 
 def rendered(tables: Tables, views: tuple[int, int], size: tuple[int, int]) -> RenderedScene:

@@ -441,27 +441,24 @@ class Watch:
     def _advice(self) -> dict[str, Any]:
         """Return the hint for the newest picture, and the steps from an unpacked box to a plan."""
         hint = self._hint()
-        axes: tuple[str, ...] = ()
-        off_um: dict[str, float | None] = {}
-        if self._driving is not None:
-            axes = self._driving.stage.axes
-            for axis in (axis for axis in axes if axis in self._centre_um):
-                at_um = self._driving.position_um(axis)
-                off_um[axis] = None if at_um is None else at_um - self._centre_um[axis]
+        axes = () if self._driving is None else self._driving.stage.axes
         listed = steps(
-            self.state["figures"], self.state["mask"], off_um, axes, self._found,
+            self.state["figures"], self.state["mask"], self._off_um(), axes, self._found,
             self._saved.takes, self._written, hint, self._wants,
         )  # fmt: skip
         return {"hint": hint, "steps": listed}
 
+    def _off_um(self) -> dict[str, float | None]:
+        """Return by axis how far it stands from centred; None: not homed."""
+        driving = self._driving
+        if driving is None:
+            return {}
+        at_um = {axis: driving.position_um(axis) for axis in self._centre_um}
+        return {a: None if um is None else um - self._centre_um[a] for a, um in at_um.items()}
+
     def _away(self) -> list[str]:
         """Return the axes that stand elsewhere than centred, or not homed."""
-        return [
-            axis
-            for axis, place_um in self._centre_um.items()
-            if self._driving is not None
-            and abs((self._driving.position_um(axis) or np.inf) - place_um) > AWAY_UM
-        ]
+        return [a for a, um in self._off_um().items() if um is None or abs(um) > AWAY_UM]
 
     def _hint(self) -> dict[str, Any] | None:
         """Return the hint for the newest picture; None where it is well exposed.
@@ -667,12 +664,8 @@ class Watch:
         assert self._design is not None
         if self._driving is None or not self._design.moving_masks:
             return 0.0, 0.0
-        x_um, y_um = (
-            (self._driving.position_um(axis) or self._centre_um.get(axis, 0.0))
-            - self._centre_um.get(axis, 0.0)
-            for axis in ("mask_x", "mask_y")
-        )
-        return x_um, y_um
+        off_um = self._off_um()
+        return off_um.get("mask_x") or 0.0, off_um.get("mask_y") or 0.0
 
     def _show_light_field(self, newest: Shown) -> None:
         assert self.light_field is not None

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated_raw_camera import SimulatedRawCamera
 
 from emmc_rig.bench.conformance.cameras import *  # noqa: F403
 from emmc_rig.drivers.camera import Camera, RawFileCamera
@@ -31,9 +30,20 @@ def see(exposure_s):
     return MOSAIC
 
 
+class Files:
+    """A `drivers.camera.CaptureTransport` whose every file shows `MOSAIC`."""
+
+    def __init__(self, clock):
+        self.clock = clock
+
+    def capture(self, exposure_s):
+        self.clock.sleep(exposure_s)
+        return encode_dng(MOSAIC, CFA, 64, 4095, exposure_s)
+
+
 def raw_file_camera(folder):
     clock = ManualClock()
-    return RawFileCamera(SimulatedRawCamera(see, clock, CFA), SHAPE, CFA, clock=clock)
+    return RawFileCamera(Files(clock), SHAPE, CFA, clock=clock)
 
 
 def ptp_camera(folder):
@@ -66,7 +76,7 @@ class DumpCamera(RawFileCamera):
 
 def dump_camera(folder):
     clock = ManualClock()
-    return DumpCamera(SimulatedRawCamera(see, clock, CFA), SHAPE, CFA, clock=clock)
+    return DumpCamera(Files(clock), SHAPE, CFA, clock=clock)
 
 
 CAMERAS = {

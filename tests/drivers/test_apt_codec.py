@@ -15,7 +15,6 @@ from emmc_rig.drivers.apt_codec import (
     Message,
     MotorStatus,
     StatusBit,
-    VelocityParameters,
 )
 from emmc_rig.drivers.errors import GarbledReplyError
 
@@ -46,10 +45,6 @@ def test_a_message_with_data_flags_its_destination_and_states_the_length():
     assert codec.decode(wire) == Message(Id.MOT_MOVE_ABSOLUTE, 0, 0, 0x50, 1, data)
 
 
-def test_negative_positions_are_twos_complement_little_endian():
-    assert codec.encode_position(1, -2) == bytes.fromhex("01 00 fe ff ff ff")
-
-
 def test_a_status_update_is_read_with_a_signed_velocity():
     # MOT_GET_DCSTATUSUPDATE: channel, position, velocity, reserved, status bits
     data = bytes.fromhex("01 00 40 0d 03 00 fe ff 00 00 10 05 00 80")
@@ -62,15 +57,6 @@ def test_a_status_update_is_read_with_a_signed_velocity():
     assert bits & StatusBit.CONNECTED
     assert bits & StatusBit.MOVING_A
     assert not bits & StatusBit.HOMING
-
-
-def test_a_move_that_completed_carries_the_same_status():
-    status = MotorStatus(1, -5, 0, int(StatusBit.HOMED))
-    wire = codec.encode(
-        Id.MOT_MOVE_COMPLETED, codec.HOST, data=codec.encode_status(status), source=0x50
-    )
-    assert wire[:6] == bytes.fromhex("64 04 0e 00 81 50")
-    assert codec.decode_status(codec.decode(wire)) == status
 
 
 def test_hardware_information_is_read():
@@ -100,12 +86,6 @@ def test_velocity_and_acceleration_have_the_documented_scale():
     # units for a millimetre, a millimetre per second, and a millimetre per second squared
     assert codec.velocity_units(1000.0, 34.304) == pytest.approx(767_367.49, abs=0.01)
     assert codec.acceleration_units(1000.0, 34.304) == pytest.approx(261.93, abs=0.01)
-
-
-def test_velocity_parameters_survive_the_wire():
-    parameters = VelocityParameters(1, 0, 261, 767_367)
-    message = Message(Id.MOT_GET_VELPARAMS, 0, 0, 1, 0x50, codec.encode_velocity(parameters))
-    assert codec.decode_velocity(message) == parameters
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import pytest
 
 from emmc_rig.drivers import apt_codec as codec
-from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage, identify
+from emmc_rig.drivers.apt import ACTUATORS, AptAxis, AptStage
 from emmc_rig.drivers.apt_codec import Id, StatusBit
 from emmc_rig.drivers.errors import (
     AxisFaultError,
@@ -120,16 +120,6 @@ def test_a_position_that_a_flipped_bit_made_is_not_believed(bench):
         assert read_um == pytest.approx(1000.0, abs=0.1), bit
 
 
-def test_a_blocked_motor_is_a_stall_and_homing_clears_it(bench):
-    stage = bench.homed()
-    bench.device.faults.inject("stall")
-    with pytest.raises(AxisFaultError, match="motor is blocked") as caught:
-        stage.move_to_um({"x": 5000.0})
-    assert "status 0x" in caught.value.reply
-    stage.home()
-    stage.move_to_um({"x": 5000.0})
-
-
 def test_a_motor_that_is_not_connected_is_a_complaint_with_its_words(bench):
     stage = bench.homed()
     bench.device.faults.inject("motor_unplugged")
@@ -182,23 +172,8 @@ def test_a_speed_reaches_the_controller_in_its_own_units(bench):
     assert stage.speed_um_s("x") == pytest.approx(1000.0, rel=1e-5)
 
 
-def test_it_says_what_it_is(bench):
-    info = identify(bench.transport, bench.clock)
-    assert (info.model, info.serial_number, info.firmware) == ("KDC101", 27_000_001, "2.0.3")
-
-
 def test_a_controller_that_is_not_there_shows_at_construction(bench):
     rack = Bench({0x21: Z825, 0x22: Z825})
     with pytest.raises(TransportTimeoutError) as caught:
         rack.stage(z=AptAxis(rack.transport, Z825_MOTOR, destination=0x25))
     assert (caught.value.axis, caught.value.command) == ("z", "MOT_REQ_VELPARAMS")
-
-
-def test_a_tolerance_finer_than_half_a_count_is_refused(bench):
-    with pytest.raises(ValueError, match="loosen it"):
-        bench.stage(StageSettings(tolerance_um=0.01))
-
-
-def test_actuators_have_the_travel_of_their_names():
-    assert ACTUATORS["z812"].travel_um == 12_000.0
-    assert ACTUATORS["mts50-z8"].travel_um == 50_000.0

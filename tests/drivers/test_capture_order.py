@@ -53,13 +53,6 @@ def test_where_a_file_states_no_time_names_decide_and_what_disagrees_is_named():
     assert ordered(["a.dng", "b.dng", "c.dng"], [10, None, 20])[1] == ()
 
 
-def test_a_clock_set_back_by_an_hour_leaves_the_order_of_names_and_is_said():
-    before = datetime(2026, 10, 25, 2, 59)
-    names, (note,) = ordered([f"s{n}.dng" for n in range(4)], [0, 30, 60 - 3600, 90 - 3600], before)
-    assert names == ["s0.dng", "s1.dng", "s2.dng", "s3.dng"]
-    assert "end of summer time: ordered by name" in note
-
-
 def test_times_with_their_zones_need_no_guess_at_the_end_of_summer_time():
     summer, winter = (timezone(timedelta(hours=hours)) for hours in (2, 1))
     times = [

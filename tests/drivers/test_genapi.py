@@ -1,17 +1,13 @@
 """GenICam features by EMVA's library: refusals before anything is sent, values from no cache."""
 
 import lzma
-import struct
 import sys
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from random import Random
 
 import pytest
-from fuzzing import fuzz
-from hypothesis import strategies as st
 
 from emmc_rig.drivers.errors import (
     CameraDescriptionError,
@@ -21,7 +17,6 @@ from emmc_rig.drivers.errors import (
     UsbGoneError,
 )
 from emmc_rig.drivers.genapi import Features
-from emmc_rig.simulators import u3v_description
 
 HEAD = (
     '<?xml version="1.0" encoding="utf-8"?><RegisterDescription ModelName="M" VendorName="V" '
@@ -62,24 +57,6 @@ def register(name="R", kind="IntReg", address=0, length=4, more="", order="Littl
 RAMP = bytes(range(1, 65))
 
 
-CONVERTED = (
-    '<Float Name="F"><pValue>C</pValue><Unit>us</Unit></Float>'
-    '<Converter Name="C"><FormulaTo>ROUND(FROM * 10)</FormulaTo>'
-    "<FormulaFrom>TO / 10</FormulaFrom><pValue>I</pValue></Converter>"
-    '<Integer Name="I"><pValue>R</pValue><Min>5</Min><Max>1000</Max></Integer>' + register()
-)
-
-
-def test_a_converter_works_both_ways_and_converts_the_limits():
-    memory = Memory(struct.pack("<I", 25) + bytes(60))
-    found = features(CONVERTED, memory)
-    assert found.value("F") == 2.5
-    assert found.limits("F") == (0.5, 100.0)
-    assert found.unit("F") == "us"
-    found.set("F", 7.34)
-    assert struct.unpack_from("<I", memory.data) == (73,)
-
-
 CHOICE = (
     '<Enumeration Name="E"><pIsLocked>Lock</pIsLocked>'
     '<EnumEntry Name="Off"><Value>0</Value></EnumEntry>'
@@ -112,13 +89,6 @@ def test_a_locked_feature_is_not_written():
     assert not found.is_writable("E")
     with pytest.raises(CameraSettingError, match="cannot be changed now"):
         found.set("E", "On")
-
-
-def test_a_command_stores_its_value():
-    memory = Memory()
-    body = '<Command Name="Go"><pValue>R</pValue><CommandValue>7</CommandValue></Command>'
-    features(body + register(), memory).execute("Go")
-    assert memory.data[0] == 7
 
 
 def test_a_number_outside_its_limits_or_steps_is_refused_before_anything_is_sent():
@@ -240,40 +210,3 @@ def test_descriptions_of_real_cameras_are_followed(peer_files):
                 acts["values"] += 1
     assert acts["cameras"] > 40, acts
     assert acts["values"] > 30, acts
-
-
-SEEDS = st.integers(0, 1 << 62)
-XML = u3v_description.describe("M", ("BayerRG8", "BayerRG12p"), (20, 20_000), (0, 240))
-WORDS = (
-    *(b"Value", b"pValue", b"Formula", b"Address", b"Length", b"Width", b"WidthLimit", b"<", b">"),
-    *(b"0", b"0x", b"-1", b"99999999999999999999", b"ALL - OFF", b"TO", b"(", b"**", b"\xff", b""),
-)
-
-
-def damaged_xml(random):
-    raw = bytearray(XML)
-    for _ in range(random.randint(1, 6)):
-        at = random.randrange(len(raw))
-        raw[at : at + random.randint(0, 12)] = random.choice(WORDS)
-    return bytes(raw)
-
-
-@pytest.mark.slow
-def test_no_xml_makes_the_reader_fail_outside_the_drivers_errors():
-    names = ("Width", "ExposureTime", "Gain", "PixelFormat", "AcquisitionStart", "BlackLevel")
-
-    def check(seed):
-        random = Random(seed)
-        try:
-            found = Features(damaged_xml(random), Memory(random.randbytes(64)))
-        except DriverError:
-            return
-        for name in names:
-            for act in (found.value, found.limits, found.choices, found.is_writable, found.has):
-                with suppress(DriverError):
-                    act(name)
-            for value in (1, "On", 2.5):
-                with suppress(DriverError):
-                    found.set(name, value)
-
-    fuzz(check, SEEDS)

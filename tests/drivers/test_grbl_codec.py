@@ -85,15 +85,6 @@ def test_a_status_report_is_read_field_by_field(line, status):
     assert decode_line(line) == status
 
 
-def test_work_position_is_machine_position_less_the_offset():
-    status = decode_line(b"<Idle|WPos:1.000,0.000|FS:0,0|WCO:4.000,-2.500>\r\n")
-    assert isinstance(status, Status)
-    assert status.work is not None
-    assert status.offset is not None
-    machine = [work + offset for work, offset in zip(status.work, status.offset, strict=True)]
-    assert machine == [5.0, -2.5]
-
-
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
@@ -118,14 +109,6 @@ def test_bytes_that_are_no_message_are_an_error_in_one_line(line, reason):
     with pytest.raises(GarbledReplyError, match=reason) as caught:
         decode_line(line)
     assert "\n" not in str(caught.value)
-
-
-def test_codes_are_reported_in_words():
-    assert "travel" in Refusal(15).meaning
-    assert "position lost" in Alarm(1).meaning
-    assert "position kept" in Alarm(2).meaning
-    assert "position lost" in Alarm(3).meaning
-    assert "table" in Refusal(99).meaning
 
 
 def test_a_jog_is_in_millimetres_and_machine_coordinates_with_its_own_feed():

@@ -44,12 +44,6 @@ def test_every_format_unpacks_as_its_plain_twin_does(form, shape):
     np.testing.assert_array_equal(pixels.reshape(-1), twin(data, form, shape[0] * shape[1]))
 
 
-@pytest.mark.parametrize("form", FORMATS, ids=lambda form: form.name)
-def test_what_a_camera_packs_comes_out_again(form):
-    pixels = RNG.integers(0, form.white_dn, (9, 11), dtype=np.uint16, endpoint=True)
-    np.testing.assert_array_equal(unpack(pack(pixels, form), form, (9, 11)), pixels)
-
-
 @pytest.mark.parametrize("name", ["Mono8", "BayerRG12p", "BayerGB10Packed", "BayerBG16"])
 def test_padded_rows_are_unpacked_without_their_padding(name):
     form = BY_NAME[name]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from fuzzing import errors_of_the_driver_allowed, fuzz
+from fuzzing import damage, errors_of_the_driver_allowed, fuzz
 from hypothesis import strategies as st
 
 from emmc_rig.drivers import ptp_codec as codec
@@ -26,90 +26,6 @@ DNG = encode_dng(MOSAIC, "rggb", 64, 4095, 0.01)
 PACKET = 64
 MOST_TRANSFERS = 100_000
 """More than any honest session takes by far: beyond it the driver is caught in a loop."""
-
-DECODERS = (
-    codec.decode_header,
-    codec.decode_message,
-    codec.decode_handles,
-    codec.decode_description,
-    codec.DeviceInfo.decode,
-    codec.StorageInfo.decode,
-    codec.ObjectInfo.decode,
-)
-SAMPLES = (
-    codec.ObjectInfo(
-        storage=1,
-        format=codec.Format.DNG,
-        size=100,
-        parent=1,
-        name="A.DNG",
-        captured="20240101T000000",
-    ).encode(),
-    codec.StorageInfo(
-        capacity_bytes=1 << 40,
-        free_bytes=1 << 39,
-        free_images=1000,
-        description="card",
-        label="label",
-    ).encode(),
-    codec.DeviceInfo(
-        operations=(0x1001,) * 9,
-        events=(0x4002,),
-        properties=(0x500D,),
-        capture_formats=(),
-        image_formats=(),
-        maker="M",
-        model="D",
-        version="1",
-        serial="2",
-    ).encode(),
-    codec.encode_description(
-        codec.PropertyDescription(0x500D, 6, True, 100, 100, choices=(1, 2, 3))
-    ),
-    codec.encode_message(codec.Message(codec.Kind.RESPONSE, 0x2001, 5, (1, 2))),
-    codec.encode_handles((1, 2, 3)),
-)
-
-
-def damage(data, seed):
-    """Return the bytes with a few of them changed, lost, doubled or added."""
-    generator = random.Random(seed)
-    damaged = bytearray(data)
-    for _ in range(generator.randrange(1, 5)):
-        at = generator.randrange(len(damaged) + 1)
-        match generator.randrange(5):
-            case 0 if at < len(damaged):
-                damaged[at] = generator.choice((0, 1, 0x7F, 0x80, 0xFF, generator.randrange(256)))
-            case 1:
-                del damaged[at : at + generator.randrange(1, 9)]
-            case 2:
-                damaged[at:at] = generator.randbytes(generator.randrange(1, 9))
-            case 3:
-                damaged[at:at] = damaged[at : at + 16]
-            case _:
-                del damaged[at:]
-    return bytes(damaged)
-
-
-@pytest.mark.slow
-def test_decoders_read_any_bytes_or_refuse_them_in_one_line():
-    def check(data, sample, seed):
-        for decode in DECODERS:
-            for candidate in (data, damage(sample, seed)):
-                with errors_of_the_driver_allowed():
-                    decode(candidate)
-
-    fuzz(check, st.binary(max_size=200), st.sampled_from(SAMPLES), st.integers(0, 2**32))
-
-
-@pytest.mark.slow
-def test_values_of_any_type_are_read_or_refused():
-    def check(data_type, data):
-        with suppress(DriverError):
-            codec.decode_value(data_type, data)
-
-    types = st.sampled_from((*range(12), *range(0x4000, 0x400C), 0xFFFF, 0x1234))
-    fuzz(check, types, st.binary(max_size=64))
 
 
 def check_raw(seed):

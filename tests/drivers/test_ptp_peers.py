@@ -143,9 +143,9 @@ def test_libgphoto2s_camera_says_who_it_is(session):
 
 def test_our_driver_captures_and_downloads_from_libgphoto2s_camera(session):
     handles = set(session.handles())
-    taken = session.capture(0.0, lambda info: info.format == Format.JPEG)
-    assert taken.handle not in handles
-    data = session.download(taken.handle, taken.info)
+    taken, info = session.capture(0.0, lambda info: info.format == Format.JPEG)
+    assert taken not in handles
+    data = session.download(taken, info)
     np.testing.assert_array_equal(decode_raw(data).mosaic, MOSAIC)
 
 

@@ -31,8 +31,6 @@ from emmc_rig.drivers.stage import StageSettings
 from emmc_rig.drivers.transport import SerialTransport
 from emmc_rig.drivers.zaber import ZaberStage
 from emmc_rig.simulators.clock import ManualClock
-from emmc_rig.simulators.faults import Faults
-from emmc_rig.simulators.firmware import Occasion
 from emmc_rig.simulators.wire import PtyServer
 from emmc_rig.simulators.zaber import AxisSpec, ZaberChain
 
@@ -278,22 +276,6 @@ def test_a_simulator_on_tcp_is_reached_by_url_and_missed_when_it_is_gone():
 def test_a_url_that_pyserial_does_not_know_is_no_port():
     with pytest.raises(PortNotFoundError, match="is no port"):
         SerialTransport("teapot://kitchen")
-
-
-def test_a_fault_strikes_at_the_moment_it_was_armed_for():
-    faults = Faults(["stall", "drift"])
-    faults.inject("stall", skip=2)
-    assert [faults.strikes("stall") for _ in range(4)] == [False, False, True, False]
-    faults.inject("stall", times=2)
-    assert [faults.strikes("stall") for _ in range(3)] == [True, True, False]
-    faults.inject("drift", when=lambda occasion: b"move" in occasion.command)
-    assert not faults.strikes("drift", Occasion(b"home"))
-    assert faults.strikes("drift", Occasion(b"move abs 5"))
-    faults.inject("drift")
-    faults.clear()
-    assert not faults.strikes("drift")
-    with pytest.raises(ValueError, match="use one of stall, drift"):
-        faults.inject("sing")
 
 
 def test_a_second_client_of_a_tcp_stage_hears_that_it_is_busy_and_the_first_goes_on():

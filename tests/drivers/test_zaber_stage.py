@@ -12,18 +12,14 @@ from emmc_rig.drivers.errors import (
     GarbledReplyError,
     LimitExceededError,
     LostPositionError,
-    MoveTimeoutError,
     NotHomedError,
     PortGoneError,
-    PortNotFoundError,
     TransportTimeoutError,
 )
 from emmc_rig.drivers.stage import (
     DEFAULT_SETTINGS,
     Stage,
     StageSettings,
-    move_time_limit_s,
-    needs_approach,
 )
 from emmc_rig.drivers.transport import SerialTransport
 from emmc_rig.drivers.zaber import ZaberStage, find_devices
@@ -113,17 +109,6 @@ def test_homing_is_asked_for_again_when_the_answer_is_lost(bench, fault):
     assert len([line for line in bench.sent if " home" in line]) == 2
 
 
-def test_an_axis_far_slower_than_it_says_is_stopped_at_its_time_limit(stage, bench):
-    bench.chain.feed(b"/1 1 set maxspeed 2000\n")
-    start_s = bench.clock.now_s()
-    with pytest.raises(MoveTimeoutError):
-        stage.move_to_um({"mask_x": 7000.0})
-    limit_s = move_time_limit_s(7000.0, SPEC.max_speed_um_s)
-    assert limit_s == pytest.approx(3.5)
-    assert bench.clock.now_s() - start_s == pytest.approx(limit_s, abs=0.1)
-    assert len(bench.stops_sent()) == 1
-
-
 def test_alerts_between_command_and_reply_are_tolerated(bench):
     stage = bench.stage()
     for device in (1, 2):
@@ -142,16 +127,6 @@ def test_an_axis_the_device_does_not_have_shows_at_construction(bench):
     with pytest.raises(CommandRefusedError, match="check the axis numbers") as caught:
         bench.stage(axes={"focus": (1, 5)})
     assert (caught.value.reply, caught.value.axis) == ("BADAXIS", "focus")
-
-
-def test_a_speed_setting_is_microsteps_per_second_times_1_6384():
-    slow = replace(SPEC, max_speed_um_s=100.0)
-    bench = Bench({(1, 1): slow})
-    stage = bench.stage(axes={"mask_x": (1, 1)})
-    stage.home()
-    start_s = bench.clock.now_s()
-    stage.move_to_um({"mask_x": 1000.0})
-    assert bench.clock.now_s() - start_s == pytest.approx(10.0, abs=0.15)
 
 
 def test_waiting_until_settled_outlasts_a_move_that_something_else_started(stage, bench):
@@ -174,24 +149,6 @@ def test_a_reply_without_the_promised_checksum_is_not_believed(stage, bench):
     bench.chain.feed = lambda data: feed(data).partition(b":")[0] + b"\r\n"
     with pytest.raises(GarbledReplyError, match="missing"):
         stage.position_um("mask_x")
-
-
-@pytest.mark.parametrize(
-    ("start_um", "needed"),
-    [(0.0, False), (90.0, False), (90.1, True), (100.0, True), (500.0, True)],
-)
-def test_an_approach_is_needed_unless_the_move_ends_with_enough_upward_travel(start_um, needed):
-    assert needs_approach(start_um, 100.0, approach_um=10.0) is needed
-
-
-def test_a_tolerance_finer_than_half_a_microstep_is_refused(bench):
-    with pytest.raises(ValueError, match="loosen it"):
-        bench.stage(StageSettings(tolerance_um=0.4), microstep_um=1.0)
-
-
-def test_a_port_that_does_not_exist_is_named():
-    with pytest.raises(PortNotFoundError, match="/dev/no-such-port does not exist"):
-        SerialTransport("/dev/no-such-port")
 
 
 def test_an_operating_system_error_on_the_port_means_that_it_is_gone(monkeypatch):

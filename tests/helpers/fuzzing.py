@@ -1,6 +1,7 @@
 """How many random cases a fuzz or race test tries, and the damage that several of them do."""
 
 import os
+import random
 from contextlib import contextmanager
 
 from hypothesis import HealthCheck, given, settings
@@ -32,3 +33,23 @@ def errors_of_the_driver_allowed():
     except DriverError as error:
         if "\n" in str(error):
             raise AssertionError("an error of more than one line") from error
+
+
+def damage(data, seed):
+    """Return the bytes with a few of them changed, lost, doubled or added."""
+    generator = random.Random(seed)
+    damaged = bytearray(data)
+    for _ in range(generator.randrange(1, 5)):
+        at = generator.randrange(len(damaged) + 1)
+        match generator.randrange(5):
+            case 0 if at < len(damaged):
+                damaged[at] = generator.choice((0, 1, 0x7F, 0x80, 0xFF, generator.randrange(256)))
+            case 1:
+                del damaged[at : at + generator.randrange(1, 9)]
+            case 2:
+                damaged[at:at] = generator.randbytes(generator.randrange(1, 9))
+            case 3:
+                damaged[at:at] = damaged[at : at + 16]
+            case _:
+                del damaged[at:]
+    return bytes(damaged)

@@ -782,11 +782,6 @@ def test_a_frame_is_encoded_once_for_all_who_ask(monkeypatch):
     assert [view.px for view in made] == [64, 32]
 
 
-def test_there_are_no_views_without_a_light_field():
-    with fake_page() as (_, ask):
-        assert ask("GET", f"/{TOKEN}/light-field.json")[0] == 503
-
-
 def program(*arguments):
     code = "from emmc_rig.cli import main; main()"
     return [sys.executable, "-c", code, "live", *arguments]

@@ -182,20 +182,6 @@ def test_nothing_is_cut_off_at_any_width_and_every_control_has_a_name(page):
             assert width > 500 or page.execute_script(TOO_LOW_FOR_A_FINGER) == []
 
 
-def test_centring_lights_the_picture_and_jogging_moves_the_simulated_stage(page, rig):
-    click(page, "#centre")
-    wait(page, lambda: place_um(page, "mask_x") == pytest.approx(rig.zero_um["mask_x"], abs=0.5))
-    wait(page, lambda: text(page, "busy") == "")
-    step = page.find_element(By.ID, "step")
-    step.clear()
-    step.send_keys("25")
-    click(page, "button[aria-label='mask_x up']")
-    wanted = pytest.approx(rig.zero_um["mask_x"] + 25, abs=0.5)
-    wait(page, lambda: place_um(page, "mask_x") == wanted)
-    assert rig.stage.position_um("mask_x") == wanted
-    wait(page, lambda: "0.0 %" not in page.find_element(By.CSS_SELECTOR, "#levels tr").text)
-
-
 def test_zoom_view_and_exposure_answer(page, rig):
     click(page, "#closer")
     assert text(page, "zoom") == "2x"
