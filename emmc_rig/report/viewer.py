@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emmc_rig.formats.format import Export, Film, Format
-from emmc_rig.formats.light_field_array import SEARCH_MISSES
 from emmc_rig.model.errors import CameraError
 from emmc_rig.model.files import write_text
 from emmc_rig.model.lightfield import centre_view
@@ -216,7 +215,7 @@ def overlays_of(content: Export, like: Export | None = None) -> list[Overlay]:
     if content.misfit is not None:
         found.append(Overlay("doubt", "unexplained residual", "x noise", content.misfit, 1.0, 5.0))
     if content.disparity_sigma is not None and shows_parallax(content.view_axes):
-        values, name = SEARCH_MISSES * content.disparity_sigma, "deviation of disparity"
+        values, name = content.disparity_sigma, "deviation of disparity"
         high = round_up(ends([values])[1])
         found.append(Overlay("disparity_sigma", name, "px per view", values, 0, high))
     scales = overlays_of(like) if like else []

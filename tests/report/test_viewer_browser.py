@@ -11,7 +11,6 @@ from browsers import MARKS, complaints, drawn, fits, nameless, on_screen, wait
 
 from emmc_rig.formats.cameras import find_camera
 from emmc_rig.formats.format import Export
-from emmc_rig.formats.light_field_array import SEARCH_MISSES
 from emmc_rig.formats.scenes import open_scene
 from emmc_rig.model.camera import Lens
 from emmc_rig.model.novel_view import between, sampled
@@ -201,7 +200,7 @@ def test_depth_is_that_of_python_under_the_pointer_and_where_it_is_focused(page,
         said = re.search(r"depth (\d+) ± ([\d.]+) mm", state(page))
         assert said is not None
         assert float(said[1]) == pytest.approx(expected, abs=0.5 if expected < 1000 else 5)
-        sigma = optics.sigma_mm(np.array(expected), SEARCH_MISSES * np.array(0.2))
+        sigma = optics.sigma_mm(np.array(expected), np.array(0.2))
         assert float(said[2]) == pytest.approx(float(sigma), rel=0.06)
     shown(page, focus=0)
     said = page.find_element(By.ID, "viewer-focus-value").text
