@@ -49,7 +49,7 @@ NEARLY = 3.0
 """Difference of the log evidence of causes that fit nearly alike: a factor of 20."""
 FEWEST_PINHOLES = 4
 """Whiteboards of fewer do not tell their pinholes' places from the mask's distance."""
-PLATE_STEPS, AREA_STEP = 12, 1e-3
+AREA_STEP = 1e-3
 LONE = 0.9
 """Of the squared moves of all pinholes: more in a single whiteboard may be a mask that moved."""
 LAMP, STAGE, CREEP, LENS, BLUR = "lamp", "stage", "creep", "lens", "blur"
@@ -187,34 +187,6 @@ class Geometry:
             for by in np.diag([self.cell_um / 100, self.cell_um / 100, AREA_STEP])
         ]
         return self.own((v, u), hole), np.stack(slopes, axis=1)
-
-
-def fit_plate(
-    own: OwnInformation, boards: Sequence[Board], geometry: Geometry
-) -> NDArray[np.float64]:
-    """Return how far pinholes stand off their holes, (board, 2), by one move and turn of the plate.
-
-    Least squares for the three, with the light that the aperture's edge cuts at every step.
-    """
-    few = np.array([through_pinhole(board) for board in boards])
-    turned = turned_by(boards, geometry.cell_um)
-    far_um = max(float(np.abs(turned).max()), geometry.cell_um)
-    by_plate = np.stack([np.tile([1.0, 0.0], (len(few), 1)), np.tile([0.0, 1.0], (len(few), 1)),
-                         turned / far_um], axis=-1) * few[:, None, None]  # fmt: skip
-    found = np.zeros(3)
-    for _ in range(PLATE_STEPS):
-        off_um = by_plate @ found
-        here, slopes = np.zeros((len(boards), OWN)), np.zeros((len(boards), OWN, 3))
-        for index in np.flatnonzero(few):
-            here[index], each = geometry.about(boards[index], np.append(off_um[index], 0.0))
-            slopes[index] = each[:, :2] @ by_plate[index]
-        rows = slopes.reshape(-1, 3)
-        left = own.pull - own.information @ here.ravel()
-        step = np.linalg.lstsq(rows.T @ own.information @ rows, rows.T @ left, rcond=1e-9)[0]
-        found = np.clip(found + step, -geometry.cell_um / 2, geometry.cell_um / 2)
-        if np.abs(step).max() < geometry.cell_um * 1e-4:
-            break
-    return by_plate @ found
 
 
 def through_pinhole(board: Board) -> bool:

@@ -59,7 +59,6 @@ from emmc_rig.calibration.causes import (
     covariance_of,
     doubt_lone_move,
     find_causes,
-    fit_plate,
     log_evidence,
     pinholes_found,
     possible_causes,
@@ -692,18 +691,12 @@ def _find_causes(
 def _about_pinholes(
     point: _Point, bench: _BenchPrior, found: Sequence[FoundCause], boards: Sequence[Board]
 ) -> _BenchPrior:
-    """Return the prior about the pinholes' likelier places: by the causes, or by the plate alone.
+    """Return the prior about the pinholes' likelier places, by the causes found.
 
-    Their light bends at the aperture's edge, so that causes which are compared about a wrong place
-    may share out what the plate alone explains.
+    Either with the areas found, or as if every hole were as large as a view.
     """
     still = _own_information(point, replace(bench, own=np.zeros_like(bench.own)))
     seen = bench.holes(found, point.state, boards)
-    # With the areas found, or as if every hole were as large as a view.
-    places = [seen, seen * [1, 1, 0]]
-    if not any(board.loose for board in boards):
-        by_plate = fit_plate(still, boards, bench.geometry)
-        places.append(np.column_stack([by_plate, seen[:, 2]]))
 
     def evidence(tried: _BenchPrior) -> float:
         own = OwnInformation(still.information, still.pull - still.information @ tried.own)
@@ -712,6 +705,7 @@ def _about_pinholes(
         there = float((still.pull + own.pull) @ tried.own) / 2
         return there + log_evidence(own, covariance_of(tried.causes, widths, tried.own2))
 
+    places = seen, seen * [1, 1, 0]
     return max((bench.about(place, point.state, boards) for place in places), key=evidence)
 
 
