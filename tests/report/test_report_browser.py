@@ -77,7 +77,7 @@ def test_the_folded_report_is_short_fits_and_shows_the_picture_at_once(page):
 @pytest.mark.parametrize("size", [(1600, 900), (390, 844)])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_first_screen_shows_the_coded_frame_beside_the_light_field(page, size, scheme):
-    with on_screen(page, *size, scheme):
+    with on_screen(page, size[0], size[1], scheme):
         page.execute_script("scrollTo(0, 0)")
         frame, middle = page.find_elements(By.CSS_SELECTOR, ".viewer-coded img")
         picture = page.find_element(By.ID, "viewer-picture").rect
