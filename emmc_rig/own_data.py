@@ -50,7 +50,8 @@ masks:
     pattern: {kind: picture, path: mine.png}
 """
 CELLS, CELL_UM = (64, 64), 24
-ELECTRONS_PER_S = 300_000
+ELECTRONS_PER_S, RAYS_PER_VIEW = 300_000, 512
+"""Rays of one pixel: with 128, whiteboards are grainy by more than their noise."""
 PLAN = Plan(
     camera=CAMERA_FILE,
     shots=(PlannedShot(exposure_s=(EXPOSURE_S,), repeats=2),),
@@ -81,7 +82,7 @@ def write_own_data(folder: Path, seed: int, watcher: Watcher | None = None) -> C
         SCENE, APERTURE_FACTOR, PIXEL_FACTOR, size=SIZE, views=camera.views, seed=seed
     )
     grey = np.repeat(fine.samples.mean(axis=-1, keepdims=True), 3, axis=-1)
-    rig, _ = simulated_rig(camera, grey, SIZE, seed)
+    rig, _ = simulated_rig(camera, grey, SIZE, seed, rays_per_view=RAYS_PER_VIEW)
     seeded = f"{CAMERA}# files: simulated by `emmc-rig demo --own-data`, seed {seed}\n"
     (folder / CAMERA_FILE).write_text(seeded, encoding="utf-8")
     tifffile.imwrite(folder / PHOTO, photographed(film, rng))
