@@ -83,7 +83,7 @@ def write_own_data(folder: Path, seed: int, watcher: Watcher | None = None) -> C
     )
     grey = np.repeat(fine.samples.mean(axis=-1, keepdims=True), 3, axis=-1)
     rig, _ = simulated_rig(camera, grey, SIZE, seed, rays_per_view=RAYS_PER_VIEW)
-    seeded = f"{CAMERA}# files: simulated by `emmc-rig demo --own-data`, seed {seed}\n"
+    seeded = f"{CAMERA}# files: simulated, seed {seed}\n"
     (folder / CAMERA_FILE).write_text(seeded, encoding="utf-8")
     tifffile.imwrite(folder / PHOTO, photographed(film, rng))
     rows: list[tuple] = []

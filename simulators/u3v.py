@@ -43,6 +43,7 @@ FAULTS = (
     "duplicate_reply",
     "stall_control",
     "unplug",
+    "dropped_frame",
     "lost_leader",
     "garbled_leader",
     "torn_payload",
@@ -401,6 +402,9 @@ class U3vCameraSimulator(UsbFunction):
             missed = max(0, waiting - HELD_FRAMES)
             acquisition.block += missed
             acquisition.next_start_s += missed * period_s
+        if self.faults.strikes("dropped_frame", acquisition.block):
+            acquisition.block += 1
+            acquisition.next_start_s = self._trigger_s(acquisition.next_start_s + period_s)
         self._send(exposure_s, acquisition.block, acquisition.next_start_s)
         acquisition.block += 1
         after_s = exposure_s if triggered else period_s

@@ -34,7 +34,7 @@ def shown(language):
 def test_the_page_shows_the_camera_and_the_table_as_they_are_written(made):
     assert yaml.safe_load((made / "mine.yaml").read_text()) == yaml.safe_load(shown("yaml")[0])
     assert "seed 0" in (made / "mine.yaml").read_text()
-    assert (made / "table.csv").read_text() == shown("text")[0]
+    assert (made / "table.csv").read_text() == shown("csv")[0]
 
 
 def test_frames_are_16_bit_files_that_import_reads(made):
