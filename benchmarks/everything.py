@@ -11,6 +11,7 @@ of uncommitted code have a + after the commit, and the page refuses them. Then
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import subprocess
@@ -61,7 +62,8 @@ def program(*words: str) -> Path:
 
     A command that ended once is not run again.
     """
-    out = WORK / commit_of_code() / "-".join(words).replace(os.sep, "_")[-120:]
+    digest = hashlib.sha256("\n".join(words).encode()).hexdigest()[:12]
+    out = WORK / commit_of_code() / f"{words[0]}-{digest}"
     if not (out / "metrics.json").is_file():
         subprocess.run(["emmc-rig", *words, "--out", out], check=True)
     return out
@@ -82,7 +84,7 @@ def store(name: str, rows: Iterable[dict] | pd.DataFrame, command: str) -> None:
 
 
 def chart(name: str) -> None:
-    """Every method on crops of a group."""
+    """Every method on crops of a group, and the plug-ins of the lab where they are installed."""
     asked = "--size", "64x80", "--camera", ONE_SHOT, "--camera", THREE_SHOTS
     out = program("chart", *asked, *scenes(name.split("-")[2].upper()))
     store(name, pd.read_csv(out / "chart.csv"), f"emmc-rig chart {' '.join(asked)} --scene ...")
