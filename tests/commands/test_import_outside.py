@@ -67,7 +67,7 @@ def filmed(folder, sensor, change=lambda dn: dn, cells=CELLS):
     folder /= OWN
     folder.mkdir()
     (folder / "mine.yaml").write_text(BLOCKS["yaml"])
-    names, *lines = BLOCKS["text"].splitlines()
+    names, *lines = BLOCKS["csv"].splitlines()
     table = [names, *(line for line in lines if line.split(",")[1] in ("dark", "shot"))]
     (folder / "table.csv").write_text("\n".join(table))
     tifffile.imwrite(folder / "photo.tif", photograph(CELLS))
