@@ -4,6 +4,8 @@ import re
 from pathlib import Path
 
 import typer
+from pygments.lexers.special import TextLexer
+from sphinx.highlighting import lexers
 from typer.cli import get_docs_for_click
 
 import emmc_rig
@@ -28,6 +30,7 @@ html_static_path = ["static"]
 html_css_files = ["gallery.css"]
 exclude_patterns = ["_build", "examples", "gallery/index.md"]
 myst_heading_anchors = 3
+lexers["csv"] = TextLexer()  # Pygments has none; other viewers of the pages do
 suppress_warnings = ["config.cache"]  # the gallery's settings hold classes
 
 autodoc_typehints = "description"
