@@ -280,7 +280,7 @@ def growth() -> Section:
         ("growth",),
         {
             "growth": svg_charts.lines(
-                "Processor time against pixels", ("pixels of a view", "processor seconds"), lines,
+                "Processor time against pixels", ("thousand pixels of a view", "processor seconds"), lines,
             )
         },
         table,
