@@ -280,7 +280,8 @@ def growth() -> Section:
         ("growth",),
         {
             "growth": svg_charts.lines(
-                "Processor time against pixels", ("thousand pixels of a view", "processor seconds"), lines,
+                "Processor time against pixels",
+                ("thousand pixels of a view", "processor seconds"), lines,
             )
         },
         table,
