@@ -4,6 +4,7 @@ import subprocess
 
 import measured_code
 import pytest
+import results_page
 
 BEFORE = '"""Words."""\n\nLIMIT = 3\n"""Of what."""\n'
 
@@ -43,3 +44,27 @@ def test_rows_of_changed_files_and_of_no_commit_count_as_changed(commit, tmp_pat
     assert measured_code.commit_of_code(("room",)) == f"{commit}+"
     for unknown in (f"{commit}+", "", "0123456789"):
         assert measured_code.changed_since(unknown, ("room",)) == ("room",)
+
+
+def test_a_file_is_stale_without_rows_and_with_rows_of_changed_code(commit, tmp_path, monkeypatch):
+    monkeypatch.setattr(measured_code, "RESULTS", tmp_path)
+    monkeypatch.setattr(measured_code, "FITTING", ("room",))
+    assert measured_code.stale("table") == "not measured"
+    (tmp_path / "table.csv").write_text(f"scene,commit\none,{commit}\n", "utf-8")
+    assert measured_code.stale("table") == ""
+    (tmp_path / "table.csv").write_text(f"scene,commit\none,{commit}\ntwo,\n", "utf-8")
+    assert "1 rows are of code, which no commit here has" in measured_code.stale("table")
+
+
+def test_the_page_is_not_written_from_rows_of_other_code_but_as_a_draft(monkeypatch, capsys):
+    written = []
+    monkeypatch.setattr(results_page, "stale", lambda name: "changed since: a.py")
+    monkeypatch.setattr(results_page, "made", lambda: written.append("page") or {})
+    monkeypatch.setattr("sys.argv", ["results_page.py"])
+    with pytest.raises(SystemExit, match="nothing written"):
+        results_page.main()
+    assert not written
+    assert "full-frames.csv: changed since: a.py" in capsys.readouterr().err
+    monkeypatch.setattr("sys.argv", ["results_page.py", "--draft"])
+    results_page.main()
+    assert written
