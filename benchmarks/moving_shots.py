@@ -105,7 +105,7 @@ def main() -> None:
     args = lab.parsed(parser)
     steps = args.step or (STEPS_PX[:1] if args.smallest else STEPS_PX)
     points = lab.points(args, ({"shots": args.shots, "step_px": step} for step in steps))
-    # Other processes find a cached function by its module, which must not be __main__.
+    # A cached function is pickled by the name of its module, which must not be __main__.
     module = importlib.import_module(Path(__file__).stem)
     rows = lab.measured(points, module.measure, "moving-shots", args)
     rows["loss_db"] = rows.moved_db - rows.rest_db
