@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import typer
 from pygments.lexers.special import TextLexer
@@ -27,9 +28,10 @@ extensions = [
 html_theme = "furo"
 html_title = f"emmc-rig {release}"
 html_static_path = ["static"]
-html_css_files = ["gallery.css"]
+html_css_files = ["pages.css"]
 exclude_patterns = ["_build", "examples", "gallery/index.md"]
 myst_heading_anchors = 3
+highlight_language = "none"  # commands have no language
 lexers["csv"] = TextLexer()  # Pygments has none; other viewers of the pages do
 suppress_warnings = ["config.cache"]  # the gallery's settings hold classes
 
@@ -50,9 +52,17 @@ sphinx_gallery_conf = {
 }
 
 
+def whole_summaries(group: Any) -> None:
+    """Let lists of commands have the first sentence of each whole, not its first 45 letters."""
+    for command in getattr(group, "commands", {}).values():
+        command.short_help = " ".join((command.help or "").partition("\n\n")[0].split())
+        whole_summaries(command)
+
+
 def write_command_line(_: object) -> None:
     """Write command-line.md: every command with its options, from the command line itself."""
     command = typer.main.get_command(command_line)
+    whole_summaries(command)
     context = typer.Context(command, info_name="emmc-rig")
     text = get_docs_for_click(obj=command, ctx=context, name="emmc-rig", title="Every option")
     text = re.sub("^  (emmc-rig .*)$", r"    \1", text, flags=re.M)  # examples, as code

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -22,7 +23,7 @@ def cameras(
     ] = None,
     out: Annotated[Path | None, out_option("camera-NAME")] = None,
 ) -> None:
-    """List the shipped cameras, or draw the masks of one."""
+    """List the shipped cameras, or draw the masks of one and write its description to edit."""
     if name is None:
         from emmc_rig.report.camera_list import camera_rows
 
@@ -38,6 +39,7 @@ def cameras(
         give_result(cameras=[asdict(row) for row in shown])
         return
     import emmc_rig as emmc
+    from emmc_rig.model.camera import shipped_camera_files
     from emmc_rig.report.camera_sheet import camera_figures, draw_camera
     from emmc_rig.store.folders import result_folder
     from emmc_rig.store.results import write_metrics
@@ -48,6 +50,8 @@ def cameras(
         figures = camera_figures(camera)
         draw_camera(camera, folder / "camera.png")
         write_metrics(folder, figures)
+        if shipped := shipped_camera_files().get(name):
+            shutil.copyfile(shipped, folder / "camera.yaml")
     rows = []
     for key, value in figures.items():
         if isinstance(value, dict):
@@ -60,4 +64,6 @@ def cameras(
     for warning in camera.warnings():
         say("warning", warning)
     tell(f"open {folder_name / 'camera.png'}")
+    if shipped:
+        tell(f"for a camera of your own, edit a copy of {folder_name / 'camera.yaml'}")
     give_result(folder_name)

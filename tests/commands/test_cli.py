@@ -16,6 +16,7 @@ import yaml
 from programs import PROGRAM, done, refused
 from view_files import save_views
 
+import emmc_rig as emmc
 from emmc_rig import cli
 from emmc_rig.commands.examples import EXAMPLES
 from emmc_rig.version import __version__
@@ -44,6 +45,7 @@ def test_cameras_are_listed_and_drawn(run, tmp_path):
     assert "rgbw-bayer" in out
     done(run("cameras", "rgbw-mono", "--out", "sheet"))
     assert (tmp_path / "sheet/camera.png").stat().st_size > 10_000
+    assert emmc.camera(tmp_path / "sheet/camera.yaml") == emmc.camera("rgbw-mono")
     assert json.loads((tmp_path / "sheet/metrics.json").read_text())["light_efficiency"] > 0.3
 
 

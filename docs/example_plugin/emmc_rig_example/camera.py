@@ -1,6 +1,6 @@
 """A camera that is a program: it exposes, writes a RAW file and ends, such as `rpicam-still --raw`.
 
-kind: command
+driver: command
 address: "rpicam-still --raw --immediate --shutter {exposure_us} --output {folder}/frame.jpg"
 file: frame.dng
 shape: [3040, 4056]

@@ -1,6 +1,6 @@
 """A camera of a GenTL producer, such as a maker ships with its GigE Vision or CoaXPress cameras.
 
-    kind: gentl
+    driver: gentl
     address: /opt/maker/lib/producer.cti
     serial: "40012345"
 
