@@ -304,7 +304,7 @@ def peer() -> Section:
         table.append((f"`{method}`", *figures, row["verdict"]))
     table.append(("Coded-E2LF, a network trained for it (from its authors)", "27.24 dB", "4 s", ""))
     return Section(
-        "How do others with more views compare?",
+        "How does a trained network with 8x8 views compare?",
         f"Behind three coded apertures with 8x8 grey views, `adaptive` reaches "
         f"{number(own, 'psnr_db'):.1f} dB in {number(own, 'cpu_s'):.0f} s, without training.",
         "256x256 samples of Lego Knights (Stanford archive); the true middle view in all places "
@@ -847,10 +847,10 @@ HEAD = """\
 
 <!-- Made by `python benchmarks/results_page.py`: change the rows in results/, or that script. -->
 
-Real light fields come in two groups: settings were tuned on **A**, and results are reported on
-**B**. Accuracy is the {term}`PSNR` of all views, pixels and colours against the true light field.
-One command draws the charts from the listed files; each section ends with the commands that
-measured them.
+Real light fields come in two groups. Settings were tuned on **A**; means are of **B**, which no
+setting was tuned on. Whole frames are of both. Accuracy is the {term}`PSNR` of all views, pixels
+and colours against the true light field. One command draws the charts from the listed files; each
+section ends with the commands that measured them.
 """
 
 
@@ -871,19 +871,10 @@ def run_text(file: str, runs: Mapping[str, Row]) -> str:
     )
 
 
-def current_version() -> str:
-    """Return the version of this code."""
-    text = (ROOT / "emmc_rig" / "version.py").read_text(encoding="utf-8")
-    found = re.search(r'__version__ = "(.+)"', text)
-    assert found is not None
-    return found[1]
-
-
 def older_text(files: Sequence[str], runs: Mapping[str, Row]) -> str:
-    """Return "by version 0.1.0" where a file was measured by older code than this; else ""."""
-    versions = {runs[f"{file}.csv"]["version"] for file in files}
-    older = sorted(versions - {current_version()})
-    return f"by version {' and '.join(older)}" if older else ""
+    """Return "by version 0.1.0" where the code of a file has changed since, in a draft; else ""."""
+    versions = sorted({runs[f"{file}.csv"]["version"] for file in files if stale(file)})
+    return f"by version {' and '.join(versions)}" if versions else ""
 
 
 def sections() -> tuple[list[Section], list[str]]:
@@ -911,7 +902,8 @@ def made() -> dict[Path, str]:
             files[RESULTS / "charts" / f"{name}.svg"] = chart
             says = re.search('aria-label="(.*?)"', chart)
             page.append(f"![{unescape(says[1]) if says else name}](results/charts/{name}.svg)")
-        page.append("")
+        if section.charts:
+            page.append("")
         page.append(f"**How to read this.** {section.how}\n")
         if section.table:
             page.append(table_text(section.table) + "\n")
