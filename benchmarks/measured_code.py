@@ -59,8 +59,8 @@ def commit_of_code(rooms: Iterable[str] = CALIBRATING) -> str:
 def changed_since(commit: str, rooms: tuple[str, ...] = FITTING) -> tuple[str, ...]:
     """Return the files of the rooms whose code differs from that of a commit.
 
-    Comments, docstrings, texts of errors and layout do not count. For an unknown commit, or a commit with a +, all
-    rooms are returned.
+    Comments, docstrings, texts of errors and layout do not count. For an unknown commit, or
+    one with a +, all rooms are returned.
     """
     if not commit or commit.endswith("+") or not _git("cat-file", "-t", commit):
         return rooms

@@ -138,7 +138,10 @@ def test_a_program_confirms_by_its_exit_code_within_its_time():
     [
         ({"colours": {"off": {"send": "o"}}}, r"colours\.off\.expect"),
         ({"colours": {"off": {"send": "o", "expct": "k"}}}, "did you mean 'expect'"),
-        ({"colours": {"pink": {"send": "o", "expect": "k"}}}, "pink is no colour of lights: use"),
+        (
+            {"colours": {"pink": {"send": "o", "expect": "k"}}},
+            "pink is not a colour of the lights: use",
+        ),
         ({"colours": {"white": {"send": "o", "expect": "k"}}}, "under off:"),
         ({"bauds": 9600}, "did you mean 'baud'"),
         ({"protocol": "txt"}, "must be one of text, command, mm"),
