@@ -99,7 +99,7 @@ def without_a_view(boards, design):
 REFUSED = {
     "saturated": (averaged(flat(WHITE_DN)), r"100.0% of the pixels are saturated; shorten"),
     "flickering": (averaged(flat(), flat(10_500)), r"differ by 4\.8% in .*; the lamp flickers"),
-    "two sizes": (averaged(flat(), flat(size=(20, 21))), "differ"),
+    "two sizes": (averaged(flat(), flat(size=(20, 21))), "capture all alike"),
     "no frames": (averaged(), "no frame was taken"),
     "a view missing": (without_a_view, r"missing: shot 0, view \(1, 2\), white lamp"),
     "no reference": (with_references({}), "no reference whiteboard"),

@@ -339,7 +339,7 @@ MISTAKES = {
     "a torn picture": (file_written(1, "e.png", b"\x89PNG\r\n\x1a\n123"), "cut short or damaged"),
     "a torn DNG": (file_written(1, "e.dng", b"II*\x00123"), "e.dng: unusable RAW frame"),
     "no MAT": (file_written(1, "e.mat", b"MATLAB"), "e.mat: cannot be read"),
-    "a folder": (changed(1, file="."), "no Zarr"),
+    "a folder": (changed(1, file="."), "without a Zarr group"),
     "wrong colours": (raw_file(1, "bggr"), "its colours are bggr, the camera's sensor.cfa is rggb"),
     "another exposure": (raw_file(1, exposure_s=0.05), "exposure_s 0.02, but its file states 0.05"),
     "ms for s of an OME-TIFF": (ome, "exposure_s 20, but its file states 0.02 s: ms for s?"),
@@ -640,7 +640,7 @@ def test_a_file_that_goes_while_it_is_imported_is_named(then, words, tmp_path, r
 
 
 OUTS = {
-    "s0.npy": "a file, where a folder is meant",
+    "s0.npy": "a file of that name exists",
     "s0.npy/out": "cannot be made",
     ".": "holds something already",
     "/proc/out": "/proc/out",

@@ -165,7 +165,7 @@ ONE_LINE = {
     "tables --scenes occupied": "no scenes",
     "tables --scenes gap": "is itself a scene",
     "tables --dictionary nothing.h5": "no such file",
-    "tables --out occupied": "holds something else",
+    "tables --out occupied": "holds something other",
     "tables --out occupied/thesis.txt": "a file of that name",
     "tables --out /proc/tables": "cannot be written",
     **{f"design bench-{n}.yaml": words for n, (_, words) in enumerate(BENCHES)},

@@ -145,7 +145,7 @@ def test_a_program_confirms_by_its_exit_code_within_its_time():
         ({"colours": {"white": {"send": "o", "expect": "k"}}}, "under off:"),
         ({"bauds": 9600}, "did you mean 'baud'"),
         ({"protocol": "txt"}, "must be one of text, command, mm"),
-        ({"protocol": "mm", "colours": {}}, "name the label of a shutter: or of a state device:"),
+        ({"protocol": "mm", "colours": {}}, "write shutter: or device:"),
         ({"protocol": "mm", "device": "LED", "colours": {}}, "go together"),
     ],
 )

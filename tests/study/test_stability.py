@@ -197,7 +197,7 @@ def test_a_method_that_is_not_installed_is_one_line(few_steps, undrawn, monkeypa
     missing = replace(METHODS["dict-admm"], package="no_such_module")
     monkeypatch.setitem(METHODS, "dict-admm", missing)
     outcome = swept(tmp_path / "out", methods=("tv", "dict-admm"))
-    assert outcome.excluded() == ["dict-admm needs no_such_module: not installed"]
+    assert outcome.excluded() == ["dict-admm needs no_such_module, which is not installed"]
     assert {curve.method for curve in outcome.curves} == {"tv"}
     assert {point.method for point in planned(quick(methods=("all",)))} == set(METHODS)
 
