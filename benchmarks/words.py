@@ -7,9 +7,11 @@ name of the call that a text is given to, stands after its place.
 from __future__ import annotations
 
 import ast
+import io
 import re
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -68,7 +70,10 @@ def helps() -> Iterator[tuple[str, str]]:
 
     waiting = [("emmc-rig", typer.main.get_command(cli.app))]
     for words, command in waiting:
-        yield words, command.get_help(typer.Context(command, info_name=words))
+        printed = io.StringIO()  # typer returns plain help, and prints rich help
+        with redirect_stdout(printed):
+            returned = command.get_help(typer.Context(command, info_name=words))
+        yield words, printed.getvalue() or returned
         members = getattr(command, "commands", {})
         waiting += [(f"{words} {name}", member) for name, member in members.items()]
 

@@ -49,6 +49,8 @@ SAID = {
 }
 """By the end of a file's name, what of it is read by users; of Python code strings are."""
 TEMPLATE = re.compile(r"\{[{%#].*?[}%#]\}", re.DOTALL)
+FIELD = re.compile(r"\{[^{}]*\}")
+"""Of an f-string: its name is the code's."""
 ANY = re.compile("|".join(REPLACED), re.IGNORECASE)
 KEY = re.compile(r"-{0,2}[a-z][a-z0-9_.-]*")
 """A name that files and scripts know, which stays: not a text."""
@@ -59,7 +61,7 @@ def texts(path: Path) -> Iterator[tuple[int, str]]:
     if path.suffix == ".py":
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for line, _, text in words.texts(tree, documents=path.parent.name == "commands"):
-            yield line, text
+            yield line, FIELD.sub("{}", text)
     elif path.suffix in SAID:
         text = path.read_text(encoding="utf-8")
         text = TEMPLATE.sub(lambda code: "\n" * code[0].count("\n"), text)

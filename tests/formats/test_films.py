@@ -73,7 +73,7 @@ def drop_frames(folder):
     ("damage", "words"),
     [
         (cut_metrics, "metrics.json: cannot be read"),
-        (drop_times, "5 times of 6 frames"),
+        (drop_times, "5 times for 6 frames"),
         (drop_film, "metrics.json: not that of a film"),
         (drop_frames, "a film without a frame"),
     ],
