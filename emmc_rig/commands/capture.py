@@ -74,7 +74,7 @@ def capture(
         str | None,
         typer.Option(
             "--flaws",
-            help="faults of the rig, commas between, such as tilt,lamp,crosstalk; together: all "
+            help="faults of the rig, commas between, such as tilt,lamp,crosstalk; together: most "
             "(default: none)",
             rich_help_panel=SIMULATED_PANEL,
         ),

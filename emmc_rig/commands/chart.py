@@ -24,7 +24,8 @@ def chart(
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            "--camera", help="a shipped camera or a YAML file; may repeat (default: usual ones)"
+            "--camera",
+            help="a shipped camera or a YAML file; may repeat (default: four; with --fast two)",
         ),
     ] = None,
     fast: FastOption = False,
