@@ -122,7 +122,7 @@ def _number(text: str, scale: float) -> float:
     """Return the first number in a text, none that is part of a word, scaled."""
     found = NUMBER.search(text)
     if found is None or not math.isfinite(value := float(found[0]) * scale):
-        raise ValueError(f"no number in its answer {one_line(text)[:60]!r}")
+        raise ValueError(f"no number in {one_line(text)[:60]!r}")
     return value
 
 
