@@ -322,7 +322,7 @@ def _board(
     if bright < 0.5 * reading.size:
         raise CalibrationError(
             f"the reference whiteboard under the {board.lamp} lamp is less than "
-            f"{DARKEST_REFERENCE_DN:g} DN above the dark: raise the lamp or the exposure"
+            f"{DARKEST_REFERENCE_DN:g} DN above the dark: brighten the lamp or expose longer"
         )
     channels = channels_of(layout, board.shot)
     if layout.colour is None and board.lamp in LAMP_COLOURS:

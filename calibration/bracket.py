@@ -63,7 +63,9 @@ def fuse(
     if not frames_dn or len(frames_dn) != len(exposures_s):
         raise CalibrationError("a bracket needs frames, and an exposure for each")
     if any(frame.shape != darks[0].mean_dn.shape for frame in frames_dn):
-        raise CalibrationError("a bracket's frames differ in size from the dark frame")
+        raise CalibrationError(
+            "a bracket's frames differ in size from the dark frame: capture all alike"
+        )
     order = np.argsort(exposures_s, kind="stable")
     times_s = np.asarray(exposures_s, dtype=np.float64)[order]
     shares = np.array([dark_shares(darks, time_s) for time_s in times_s])

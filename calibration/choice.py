@@ -106,7 +106,7 @@ def judge(
     """
     usable = board.usable
     if not usable.any():
-        raise CalibrationError(f"{board.name}: no usable pixel to judge by")
+        raise CalibrationError(f"{board.name}: no usable pixel to judge by; expose it otherwise")
     spread = np.broadcast_to(predicted_variance, usable.shape)
     scaled = np.empty(usable.shape, dtype=np.float32)
     missed = power = light = expected = 0.0

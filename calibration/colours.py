@@ -134,7 +134,10 @@ def other_colours(
     CalibrationError where a pixel sums several samples.
     """
     if layout.binning != 1 or layout.colour is None:
-        raise CalibrationError("crosstalk is measured only on sensors whose pixels are samples")
+        raise CalibrationError(
+            "crosstalk is measured only where a pixel is one sample (binning 1): leave "
+            "the colours out"
+        )
     at = known.fit.placement
     lost = None if known.defects is None else known.defects.lost
     mask = plain if lost is None else mask_with_losses(plain, at, lost)

@@ -978,7 +978,7 @@ def _contrast(board: Board) -> float:
     """Return how far above its noise a board varies."""
     usable = board.usable
     if not usable.any():
-        raise CalibrationError(f"{board.name}: no usable pixel")
+        raise CalibrationError(f"{board.name}: no usable pixel; expose it otherwise")
     return float(np.std(board.reading[usable]) / np.sqrt(np.median(board.variance[usable])))
 
 

@@ -124,14 +124,16 @@ def average(
             whole = frame.dtype.kind == "u"
             step_dn = 1.0 if lit or not whole else step_of_values([frame])
         if frame.shape != total.shape:
-            raise CalibrationError(f"{what}: frames of {frame.shape} and {total.shape} differ")
+            raise CalibrationError(
+                f"{what}: frames of {frame.shape} and {total.shape} pixels; capture all alike"
+            )
         total += frame
         squares += _sum_of_squares(frame)
         count += 1
         rows.append(frame.mean(axis=1, dtype=np.float64))
         levels.append(float(rows[-1].mean()))
     if total is None:
-        raise CalibrationError(f"{what}: no frame was taken")
+        raise CalibrationError(f"{what}: no frame was taken; capture one")
     spread, of_levels, of_rows = np.nan, 0.0, 0.0
     if count > 1:
         of_levels = float(np.var(levels, ddof=1))

@@ -87,8 +87,8 @@ def refuse_unfit(sets: Sequence[BoardSet]) -> None:
             if float(brightest) < DARKEST_REFERENCE_DN:
                 raise CalibrationError(
                     f"the reference whiteboard under the {lamp} lamp is less than "
-                    f"{DARKEST_REFERENCE_DN:g} DN above the dark: is the lamp on? Else raise it, "
-                    "or the exposure"
+                    f"{DARKEST_REFERENCE_DN:g} DN above the dark: is the lamp on? If it is, "
+                    "brighten it or expose longer"
                 )
         for _ in lit_boards(boards):
             pass

@@ -385,7 +385,10 @@ def _fit_models(task: _Task, readings: _Readings) -> _Modelled:
     """Return the fits of the mask, its dust and defects, and Psi by them."""
     few = task.steady.few
     if few is None:
-        raise CalibrationError("the calibration method parametric was given no whiteboards")
+        raise CalibrationError(
+            "the calibration method parametric needs open whiteboards, and there are none: "
+            "capture some"
+        )
     task.on_stage("parametric fit")
     readings = replace(readings, seen=as_readings(few, task.design, readings.good))
     for board in readings.seen:
@@ -517,7 +520,10 @@ def _measure_views(
     """
     pinholes, few, readings = task.steady.pinholes, task.steady.few, modelled.readings
     if pinholes is None:
-        raise CalibrationError("the calibration method free was given no whiteboards")
+        raise CalibrationError(
+            "the calibration method free needs whiteboards of every view, and there are "
+            "none: capture them"
+        )
     task.on_stage("Psi, free")
     free = replace(measure_psi(pinholes, task.design, empty, on_plane), good=readings.good)
     if modelled.best is not None and modelled.best.fit.causes:

@@ -120,7 +120,7 @@ class Scale:
         if len(gains) > 1:
             raise CalibrationError(
                 f"frames of one shot have several gains ({', '.join(f'{g:g}' for g in gains)}): "
-                "take them alike"
+                "capture them at one gain"
             )
         factor, first = gains.pop(), bracket[0]
         darks = [amplified(dark, factor, first.black_level_dn) for dark in self.darks]

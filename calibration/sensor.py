@@ -250,7 +250,7 @@ def characterise(
     """
     darks = sorted(darks, key=lambda pair: pair.exposure_s)
     if len({pair.exposure_s for pair in darks}) < 2:
-        raise CalibrationError("the dark current needs dark pairs at two exposures at least")
+        raise CalibrationError("the dark current needs two darks at each of two exposures at least")
     flats = iter(flats)
     dimmest = list(islice(flats, 1))
     step_dn = _step_dn([*darks, *dimmest])

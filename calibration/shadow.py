@@ -1027,7 +1027,9 @@ class Shadow:
         the picture sees.
         """
         if self.mask.binning != 1:
-            raise CalibrationError("defects are sought on sensors whose pixels are samples")
+            raise CalibrationError(
+                "defects are sought only where a pixel is one sample (binning 1)"
+            )
         middle = self._middle()
         boxes = middle.boxes.of_views(views_open)
         shape, tables = (len(pixels), len(boxes.v)), self._tables[:1]

@@ -185,7 +185,7 @@ def _references(
         if sum(dark) > LARGEST_DARK_SHARE * frame.mean_dn.size:
             raise CalibrationError(
                 f"the reference whiteboard ({what}) has pixels less than {DARKEST_REFERENCE_DN:g} "
-                "DN above the dark: raise the lamp or the exposure"
+                "DN above the dark: brighten the lamp or expose longer"
             )
         found.append(frame)
     return found

@@ -1,8 +1,16 @@
 """Errors of the drivers: their data, and a message of one line with the cause and advice."""
 
+from pathlib import Path
 from typing import Self
 
 SHOWN_BYTES = 48
+UDEV_RULE = Path(__file__).with_name("99-emmc-rig.rules")
+"""The udev rule that lets users of Linux open the devices of the bench."""
+LET_IN = (
+    f"copy {UDEV_RULE} to /etc/udev/rules.d/, run `sudo udevadm control --reload-rules`, and plug "
+    "the device in again"
+)
+"""What helps against a device that the user may not open."""
 ALL_AXES = "every axis"
 """The `axis` of an error of a controller as a whole."""
 
@@ -82,16 +90,10 @@ class PortBusyError(PortError):
 
 
 class PortPermissionError(PortError, PermissionError):
-    """The serial port exists, but this user may not open it; `rule` is the udev rule that helps."""
+    """The serial port exists, but this user may not open it."""
 
-    def __init__(self, port: str, rule: str) -> None:
-        super().__init__(
-            port,
-            "may not be opened by this user",
-            f"copy {rule} to /etc/udev/rules.d/, run `sudo udevadm control --reload-rules`, "
-            "and plug the device in again",
-        )
-        self.rule = rule
+    def __init__(self, port: str) -> None:
+        super().__init__(port, "may not be opened by this user", LET_IN)
 
 
 class PortGoneError(PortError, ConnectionError):
@@ -327,9 +329,8 @@ class UsbUnavailableError(
 class UsbPermissionError(
     _WordedError,
     PermissionError,
-    says="no permission to open {}",
-    advice="install drivers/99-emmc-rig.rules in /etc/udev/rules.d, run `udevadm control --reload` "
-    "and plug the device in again",
+    says="{} may not be opened by this user",
+    advice=LET_IN,
 ):
     """The device is there but this user may not open it."""
 

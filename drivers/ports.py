@@ -18,7 +18,6 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from emmc_rig.drivers.errors import PortNotFoundError
 
-UDEV_RULE = "99-emmc-rig.rules"
 BY_SERIAL_NUMBER = "usb:"
 PROTOCOLS_BY_USB_ID = {
     (0x0403, 0xFAF0): "apt",
@@ -81,11 +80,6 @@ def holder_of(device: str) -> str:
     """
     pid = next(_pids_with_lock(device), None) or next(pids_with_open_file(device), None)
     return "" if pid is None else f"{_program(pid)} (pid {pid})"
-
-
-def udev_rule_path() -> Path:
-    """Return where the udev rule lies that lets a user open the devices of the bench."""
-    return Path(__file__).with_name(UDEV_RULE)
 
 
 def _pids_with_lock(device: str) -> Iterator[int]:

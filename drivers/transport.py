@@ -26,7 +26,6 @@ from emmc_rig.drivers.ports import (
     BY_SERIAL_NUMBER,
     find_port,
     holder_of,
-    udev_rule_path,
     usb_serial_number,
 )
 
@@ -291,7 +290,7 @@ def _port_error(wanted: str, device: str, error: Exception) -> DriverError:
     code = getattr(error, "errno", None)
     text = str(error)
     if code in _FORBIDDEN:
-        return PortPermissionError(wanted, str(udev_rule_path()))
+        return PortPermissionError(wanted)
     if code in _ABSENT or "FileNotFoundError" in text:
         return PortNotFoundError(wanted)
     if "://" in device:

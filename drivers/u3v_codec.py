@@ -165,7 +165,7 @@ def decode_acknowledge(raw: bytes) -> Acknowledge:
         raise CameraFormatError(raw, f"{len(raw)} bytes are no acknowledge")
     prefix, status, command, length, request_id = _HEADER.unpack_from(raw)
     if prefix != COMMAND_PREFIX:
-        raise CameraFormatError(raw, "it has not the prefix of an acknowledge")
+        raise CameraFormatError(raw, "it lacks the prefix of an acknowledge")
     if command not in ACKNOWLEDGES:
         raise CameraFormatError(raw, f"{command:#06x} is no acknowledge")
     data = raw[HEADER_SIZE:]

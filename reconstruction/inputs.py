@@ -62,7 +62,9 @@ def checked_inputs(psi: Psi, frames: Frames) -> Frames:
     check_frames(psi.frames_shape, frames.readings)
     usable, used = frames.usable, frames.readings[frames.usable]
     if not used.size:
-        raise ReconstructionError("no usable pixel: every one is saturated or excluded")
+        raise ReconstructionError(
+            "no usable pixel, every one is saturated or excluded: expose shorter"
+        )
     deviation = frames.deviation[usable]
     wrong = deviation[~(np.isfinite(deviation) & (deviation >= 0))]
     if wrong.size:

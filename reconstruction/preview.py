@@ -36,7 +36,7 @@ def coarser(psi: Psi, factor: int) -> Psi:
     """
     k = psi.binning
     if factor % k:
-        raise ValueError(f"blocks of {factor} samples cut pixels of {k}")
+        raise ValueError(f"blocks of {factor} samples cut pixels of {k}: use a multiple of {k}")
     shots, views_v, views_u, rows, stored, columns = psi.weights.shape
     part = factor // k
     high, wide = rows // factor, columns // factor

@@ -483,7 +483,9 @@ def verdict_on(grid: Grid, verdicts: Iterable[Verdict | None], binning: int) -> 
             row, column = (part.start // binning for part in block.outer)
             judged.append(JudgedBlock(verdict, row, column, samples // binning**2))
     if not judged:
-        raise ReconstructionError("no usable pixel: every one is saturated or excluded")
+        raise ReconstructionError(
+            "no usable pixel, every one is saturated or excluded: expose shorter"
+        )
     return judged_together(judged)
 
 
@@ -515,7 +517,9 @@ def reconstruct_in_blocks(
     started = running_s()
     check_frames(psi.frames_shape, frames.readings)
     if not frames.usable.any():
-        raise ReconstructionError("no usable pixel: every one is saturated or excluded")
+        raise ReconstructionError(
+            "no usable pixel, every one is saturated or excluded: expose shorter"
+        )
     survey = surveyed(name, psi, frames, dictionary, settings)
     grid = grid_of(psi, dictionary, settings, survey.halo)
     frames = survey.applied(frames.of_one_deviation())

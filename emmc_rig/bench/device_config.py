@@ -283,7 +283,9 @@ class _ColouredLights(Settings):
         named = {words.get(str(key), str(key)): value for key, value in colours.items()}
         for colour in named:
             if colour not in COLOURS:
-                raise ValueError(f"{colour} is no colour of lights: use {', '.join(COLOURS)}")
+                raise ValueError(
+                    f"{colour} is not a colour of the lights: use {', '.join(COLOURS)}"
+                )
         if named and "off" not in named:
             raise ValueError("say how the lights are switched off, under off:")
         return named
@@ -335,7 +337,7 @@ class MicroManagerLightsConfig(_ColouredLights):
     @model_validator(mode="after")
     def _some_device(self) -> Self:
         if not (self.shutter or self.device):
-            raise ValueError("name the label of a shutter: or of a state device:")
+            raise ValueError("write shutter: or device:, with the label of that device")
         if bool(self.device) != bool(self.colours):
             raise ValueError("device: and colours:, its position for each colour, go together")
         return self

@@ -252,7 +252,9 @@ def _check_values(frames: NDArray, name: str, white_dn: int) -> None:
     """Raise AppError for values that no sensor reads out; white_dn: in the file's own units."""
     if frames.dtype.kind == "f" and not np.isfinite(frames).all():
         bad = int(np.count_nonzero(~np.isfinite(frames)))
-        raise AppError(f"{name}: {bad} pixel(s) are no numbers (NaN or infinite); correct the file")
+        raise AppError(
+            f"{name}: pixels that are no numbers (NaN or infinite): {bad}; correct the file"
+        )
     low, high = frames.min(), frames.max()
     if low < 0:
         raise AppError(
@@ -384,7 +386,8 @@ class _Import:
         if count > have and count - 1 not in placed:
             raise AppError(
                 f"shots 0 to {count - 1} have files, and the camera has {have} "
-                "shot(s): write mask_x_um and mask_y_um of the others, or more shots into its file"
+                f"shot{'s' * (have > 1)}: write mask_x_um and mask_y_um of the others, or more "
+                "shots into its file"
             )
         if count < have:
             self._notes.append(f"{count} of the camera's {have} shots have files")

@@ -160,7 +160,10 @@ def read_table(path: Path) -> list[Listed]:
         # Spreadsheets write empty cells beyond the last column.
         given = {name: cell for name, cell in zip_longest(names, cells, fillvalue="") if cell}
         if "" in given or len(cells) < columns:
-            raise AppError(f"{where}: {len(cells)} cells under {columns} columns")
+            raise AppError(
+                f"{where}: {len(cells)} cells under {columns} columns; give a row a "
+                "cell for each, empty where it has no value"
+            )
         # A column that nobody fills is checked too: it may be misspelt.
         row = validated(Row, dict.fromkeys(unknown, "") | given, where, AppError)
         found.append(_listed(row, where, path.parent))
@@ -191,7 +194,7 @@ def rows_of_globs(globs: Mapping[ImportedKind, Sequence[str]]) -> list[Listed]:
                 matching = sorted(glob.glob(files, recursive=True), key=natural)
                 names = [f"{name}@{array}" for name in matching]
             if not names:
-                raise AppError(f"{pattern}: no file is called so ({kind})")
+                raise AppError(f"{pattern}: no file of that name or pattern ({kind}); correct it")
             listed = (_listed(Row(file=name, kind=kind), name, Path()) for name in names)
             found += [replace(row, pattern=pattern) for row in listed]
     return found

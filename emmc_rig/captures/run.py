@@ -157,7 +157,7 @@ def begun_session(request: CaptureRequest, disk: Disk = SYSTEM_DISK) -> Session 
             f"{request.out}: its {JOURNAL} is gone; restore it from a copy, or name another folder"
         )
     if request.out.exists() and (request.out.is_file() or any(request.out.iterdir())):
-        raise AppError(f"{request.out}: holds something else than a session; name another folder")
+        raise AppError(f"{request.out}: holds something other than a session; name another folder")
     refuse_inside_session(request.out)
     return None
 

@@ -50,7 +50,12 @@ def calibrate(
         float, typer.Option("--target", help="with --plan: relative error of Psi to reach")
     ] = 0.005,
     frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="with --plan: most frames")
+        int | None,
+        typer.Option(
+            "--frames",
+            min=1,
+            help="with --plan: frames at most (default: as few as reach --target)",
+        ),
     ] = None,
     few: Annotated[
         bool,

@@ -58,18 +58,24 @@ def capture(
     seed: Annotated[
         int,
         typer.Option(
-            "--seed", min=0, help="of the random scene and noise", rich_help_panel=SIMULATED_PANEL
+            "--seed", min=0, help="seed of the scene and noise", rich_help_panel=SIMULATED_PANEL
         ),
     ] = 0,
     rays: Annotated[
         int | None,
-        typer.Option("--rays", min=16, help="per view and pixel", rich_help_panel=SIMULATED_PANEL),
+        typer.Option(
+            "--rays",
+            min=16,
+            help="rays traced per view and pixel (default: 128; to calibrate within 1 %: 1024)",
+            rich_help_panel=SIMULATED_PANEL,
+        ),
     ] = None,
     flaws: Annotated[
         str | None,
         typer.Option(
             "--flaws",
-            help="what is wrong with it, for instance tilt,lamp,crosstalk; or together",
+            help="faults of the rig, commas between, such as tilt,lamp,crosstalk; together: most "
+            "(default: none)",
             rich_help_panel=SIMULATED_PANEL,
         ),
     ] = None,
@@ -77,7 +83,7 @@ def capture(
         bool,
         typer.Option(
             "--real-time",
-            help="moves and exposures take as long as on a bench",
+            help="let moves and exposures take as long as on a bench",
             rich_help_panel=SIMULATED_PANEL,
         ),
     ] = False,
@@ -85,7 +91,7 @@ def capture(
         str | None,
         typer.Option(
             "--until",
-            help="as 30dB: skip the plan's further shots once this accuracy is estimated",
+            help="PSNR, such as 30dB: the plan's further shots are skipped once it is estimated",
         ),
     ] = None,
     dry_run: Annotated[
@@ -96,7 +102,7 @@ def capture(
     steer: Annotated[
         bool,
         typer.Option(
-            "--steer", help="as --page, which can also pause, capture frames again, and finish"
+            "--steer", help="as --page, with buttons that pause, take frames again and finish"
         ),
     ] = False,
     other_devices: Annotated[
@@ -231,7 +237,8 @@ def _estimate_words(expected: Estimate, most: str) -> str:
 
     count, guessed = expected.by_hand, expected.guessed
     hands = f", {count} change{'s' * (count > 1)} by hand" if count else ""
-    excluded = f"; time excludes {guessed} exposures that are metered first" if guessed else ""
+    plural = "s that are" if guessed > 1 else " that is"
+    excluded = f"; time excludes {guessed} exposure{plural} metered first" if guessed else ""
     return (
         f"{most}{expected.frames} frames to take, about "
         f"{shown_seconds(expected.seconds)} and {shown_bytes(expected.bytes)}{hands}{excluded}"
@@ -245,7 +252,8 @@ def _say_complete(session: Session, outcome: RunEnd) -> None:
     from emmc_rig.session.session import REPORT
     from emmc_rig.store.results import shown_seconds
 
-    retried = f", {outcome.retries} retries" if outcome.retries else ""
+    again = f"{outcome.retries} time{'s' * (outcome.retries > 1)}"
+    retried = f", tried again {again}" if outcome.retries else ""
     tell(
         f"complete: {len(session.needed)} frames verified, {outcome.taken} taken in "
         f"{shown_seconds(outcome.seconds)}{retried}; in {session.folder}"

@@ -14,7 +14,7 @@ from emmc_rig.commands.options import (
     OutOption,
     ScenesOption,
     SeedOption,
-    SizeOption,
+    size_option,
 )
 from emmc_rig.commands.output import show_study, shown_progress
 
@@ -23,14 +23,20 @@ def chart(
     scene: ScenesOption = None,
     camera: Annotated[
         list[str] | None,
-        typer.Option("--camera", help="a shipped camera or a YAML file; may repeat"),
+        typer.Option(
+            "--camera",
+            help="a shipped camera or a YAML file; may repeat (default: four; with --fast two)",
+        ),
     ] = None,
     fast: FastOption = False,
     method: MethodsOption = None,
     dictionary: DictionaryOption = None,
-    size: SizeOption = None,
+    size: Annotated[str | None, size_option("the whole; with --fast 64x80")] = None,
     repeats: Annotated[
-        int | None, typer.Option("--repeats", min=1, help="timed runs of each method")
+        int | None,
+        typer.Option(
+            "--repeats", min=1, help="timed runs of each method (default: 5; with --fast 3)"
+        ),
     ] = None,
     seed: SeedOption = 0,
     out: OutOption = Path("emmc-chart"),

@@ -38,7 +38,7 @@ def conform(
     suites = _suites(device)
     if only is not None:
         if only not in suites:
-            raise AppError(f"--as {only}: {device} is a {' or a '.join(suites)}")
+            raise AppError(f"--as {only}: {device} is a {' or a '.join(suites)}: leave --as out")
         suites = [only]
     if "stage" in suites and not yes and not device.startswith("simulated"):
         question = (

@@ -18,7 +18,7 @@ from emmc_rig.commands.options import (
     SceneOption,
     SeedOption,
     ShotsOption,
-    SizeOption,
+    size_option,
 )
 from emmc_rig.commands.output import give_result, say, show_verdict, shown_progress, tell
 
@@ -32,7 +32,7 @@ def demo(
     camera: CameraOption = DEFAULT_CAMERA,
     shots: ShotsOption = None,
     seed: SeedOption = 0,
-    size: SizeOption = None,
+    size: Annotated[str | None, size_option("the whole; of a built-in scene 108x144")] = None,
     method: MethodOption = None,
     exact_psi: Annotated[
         bool, typer.Option("--exact-psi", help="reconstruct with the exact Psi too, for comparison")
@@ -94,8 +94,9 @@ def demo(
         middle_name(described.view_axes),
     )
     tell(
-        f"PSNR {metrics['psnr_db']:.2f} dB from {metrics['shots']} shot(s), {gain:+.2f} dB over "
-        f"the baseline ({middle} in all places); SSIM {metrics['ssim']:.3f}; "
+        f"PSNR {metrics['psnr_db']:.2f} dB from {metrics['shots']} "
+        f"shot{'s' * (metrics['shots'] > 1)}, {gain:+.2f} dB over the baseline "
+        f"({middle} in all places); SSIM {metrics['ssim']:.3f}; "
         + f"calibration error {metrics['psi_relative_error']:.2%}; {metrics['status']}"
         + (f" ({metrics['advice']})" if metrics["advice"] else "")
     )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from emmc_rig.commands.options import OutOption, ScenesOption, SeedOption, SizeOption
+from emmc_rig.commands.options import OutOption, ScenesOption, SeedOption, size_option
 from emmc_rig.commands.output import show_study, shown_progress
 
 
@@ -15,11 +15,11 @@ def design(
     bench: Annotated[
         Path | None,
         typer.Argument(
-            help="a YAML file that describes the bench (default: one of docs/design.md)"
+            help="a YAML file that describes the bench (default: the bench in docs/design.md)"
         ),
     ] = None,
     scene: ScenesOption = None,
-    size: SizeOption = None,
+    size: Annotated[str | None, size_option("96x96")] = None,
     seed: SeedOption = 0,
     out: OutOption = Path("emmc-design"),
 ) -> None:

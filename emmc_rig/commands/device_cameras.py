@@ -31,7 +31,7 @@ RigOption = Annotated[
 ]
 ExposureOption = Annotated[
     str | None,
-    typer.Option("--exposure", help="as 0.02 or 20ms (default: as the camera is set)"),
+    typer.Option("--exposure", help="seconds, or 20ms (default: as the camera is set)"),
 ]
 GainOption = Annotated[
     float | None, typer.Option("--gain", help="1: the lowest ISO (default: as the camera is set)")
@@ -171,7 +171,7 @@ def save_frame(folder: Path, frame: RawFrame) -> Path:
     original = stem.with_suffix(file.suffix)
     ok, png = cv2.imencode(".png", preview(frame))
     if not ok:
-        raise AppError(f"{stem}: its preview cannot be made")
+        raise AppError(f"{stem}: no preview can be made of this frame: take it again")
     facts = {
         "camera_bytes": original.name,
         "sha256": file.sha256,

@@ -42,7 +42,9 @@ app = typer.Typer(
 
 RigOption = Annotated[
     str | None,
-    typer.Option("--rig", help="simulated, simulated:grbl or simulated:apt, instead of --stage"),
+    typer.Option(
+        "--rig", help="simulated, simulated:grbl or simulated:apt, instead of real devices"
+    ),
 ]
 AxesArgument = Annotated[list[str] | None, typer.Argument(help="names of axes (default: all)")]
 
@@ -275,7 +277,9 @@ def lights(
     if rig != SIMULATED:
         spec = rig_description(rig, ImagedRig(scene="deep-occlusions")).get("lights")
     if spec is None:
-        raise AppError(f"{rig}: has no lights: part, so that a person switches them: add one")
+        raise AppError(
+            f"{rig}: names no lights, so a person switches them: describe them under lights:"
+        )
     with shown_progress("lights"), closing(open_lights(spec)) as opened:
         answer = "" if colour is None else opened.set(colour)
         name, colours = opened.name, opened.colours
@@ -310,9 +314,12 @@ def jog(
         bool, typer.Option("--to", help="move to this position instead of by this distance")
     ] = False,
     home_first: Annotated[
-        bool, typer.Option("--home", help="home it first, and all axes where one alone cannot be")
+        bool,
+        typer.Option("--home", help="home it first, with all other axes where none is homed alone"),
     ] = False,
-    speed_um_s: Annotated[float | None, typer.Option("--speed", help="in um/s")] = None,
+    speed_um_s: Annotated[
+        float | None, typer.Option("--speed", help="um/s (default: the axis's own)")
+    ] = None,
     stage: StageOption = None,
     rig: RigOption = None,
 ) -> None:
@@ -348,7 +355,10 @@ def free(
     axis: Annotated[str, typer.Argument(help="name of the axis")],
     direction: Annotated[
         Direction | None,
-        typer.Option("--direction", help="off the switch; up leads to larger positions"),
+        typer.Option(
+            "--direction",
+            help="off the switch; up: to larger positions (default: as the stage reports)",
+        ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask before each step")] = False,
     stage: StageOption = None,
@@ -415,9 +425,9 @@ def _asked_direction(axis: str, yes: bool) -> Direction:
 @app.command("udev-rule")
 def udev_rule() -> None:
     """Print the udev rule that lets users open the devices (Linux)."""
-    from emmc_rig.drivers.ports import udev_rule_path
+    from emmc_rig.drivers.errors import UDEV_RULE
 
-    tell(udev_rule_path().read_text(encoding="utf-8").removesuffix("\n"))
+    tell(UDEV_RULE.read_text(encoding="utf-8").removesuffix("\n"))
 
 
 @contextmanager

@@ -11,7 +11,7 @@ calibrate --plan
 calibrate plan-session
 mask photo.png --cells 52x102 --cell-um 36 --out mask.png
 mask photo.dng --cells 52x102 --cell-um 36 --ordered ordered.png --out mask.png
-import table.csv
+import table.csv --camera my-camera.yaml
 import --camera my-camera.yaml --shots "frames/*.tif" --darks "darks/*.tif"
 demo
 demo --scene near-planar --camera rgbw-bayer-1shot
@@ -34,9 +34,9 @@ tables --scenes light-fields
 design bench.yaml
 design bench.yaml --scene near-planar --out designs
 devices camera --rig simulated
-devices camera --camera usb
+devices camera --camera u3v:
 devices snap --rig simulated
-devices snap --rig bench.yaml --exposure 0.02 --count 4 --out frames
+devices snap --camera u3v: --exposure 0.02 --count 4 --out frames
 devices conform simulated --as camera
 devices conform grbl:/dev/ttyUSB0
 devices list
@@ -50,11 +50,11 @@ devices lights white --rig simulated
 devices info --rig simulated
 devices info --stage zaber:/dev/ttyUSB0
 devices home --rig simulated
-devices home x --rig bench.yaml
-devices jog x 500 --rig simulated
-devices jog x --to 12000 --rig bench.yaml
+devices home x --stage bench.yaml
+devices jog mask_x 500 --home --rig simulated
+devices jog x --to 12000 --stage bench.yaml
 devices free x --stage grbl:/dev/ttyUSB0
-devices free x --direction up --rig bench.yaml
+devices free x --direction up --stage bench.yaml
 devices udev-rule
 devices udev-rule | sudo tee /etc/udev/rules.d/99-emmc-rig.rules
 session list
@@ -66,7 +66,7 @@ session verify plan-session --json
 session export plan-session --out session.h5
 session export plan-session --dng --out frames
 session sheet plan-session
-session sheet plan-session --out sheet.html
+session sheet plan-session --out sheet
 """.strip().splitlines()
 
 

@@ -104,7 +104,8 @@ def _write_as(
         about = {"source": source, "format": kind.name, "keeps": kind.keeps}
         write_metrics(folder, {**about, **facts, "bytes": written})
         shown = files[0].relative_to(folder) if len(files) == 1 else None
-    tell(f"wrote {out / shown if shown else out}, {shown_bytes(written)} in {len(files)} file(s)")
+    count = f"{len(files)} file{'s' * (len(files) > 1)}"
+    tell(f"wrote {out / shown if shown else out}, {shown_bytes(written)} in {count}")
     give_result(out)
 
 

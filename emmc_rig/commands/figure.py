@@ -25,14 +25,19 @@ def figure(
     at: Annotated[
         list[str] | None,
         typer.Option(
-            "--at", metavar="Y,X", help="row and column of a close-up's centre; may repeat"
+            "--at",
+            metavar="Y,X",
+            help="row and column of a close-up's centre; may repeat (default: two with many edges)",
         ),
     ] = None,
     side: Annotated[
-        int | None, typer.Option("--side", min=4, help="a close-up's side, pixels")
+        int | None,
+        typer.Option(
+            "--side", min=4, help="side of a close-up, pixels (default: 16 % of the width)"
+        ),
     ] = None,
     width: Annotated[
-        float, typer.Option("--width", min=2, max=40, help="of the figure, in inches")
+        float, typer.Option("--width", min=2, max=40, help="width of the figure, inches")
     ] = 7.16,
     size: ExportSizeOption = None,
     out: OutOption = Path("emmc-figure"),

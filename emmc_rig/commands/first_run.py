@@ -39,7 +39,7 @@ PARTS = {
 """By method, the groups of kernels that other processes compile: the slowest group first, last the
 group that this process needs first. For a method without an entry they compile all its kernels."""
 
-NOT_KEPT = "no folder to keep them can be written to (set NUMBA_CACHE_DIR to one that can)"
+NOT_KEPT = "no folder to keep it is writable (set NUMBA_CACHE_DIR to one that is)"
 
 
 @dataclass
@@ -60,9 +60,9 @@ class Helpers(event.Listener):
             return
         self.started = True
         if not is_kept(kernels.__file__):
-            say("note", f"compiling kernels, as every run here: {NOT_KEPT}")
+            say("note", f"compiling the methods, in every run: {NOT_KEPT}")
             return
-        say("first run", "compiling kernels for this machine, once; later runs start at once")
+        say("first run", "compiling the methods for this machine, once; later runs start at once")
         parts = PARTS.get(self.method, (self.method,))
         others = min(len(parts), get_num_threads() - 1)  # on one core they would only be in the way
         with suppress(OSError):  # no process more can be had

@@ -27,7 +27,7 @@ def import_(
         ),
     ] = None,
     darks: Annotated[
-        list[str] | None, typer.Option("--darks", help="without a table: darks")
+        list[str] | None, typer.Option("--darks", help="without a table: dark frames, lamp off")
     ] = None,
     whites: Annotated[
         list[str] | None,
@@ -55,7 +55,7 @@ def import_(
     if not camera:
         raise typer.BadParameter("--camera: name the camera that took the files")
     if (table is None) == (not given):
-        raise typer.BadParameter("name a table, or the shots by --shots and others by their globs")
+        raise typer.BadParameter("name a table, or the files by --shots 'shot*.tif' and the like")
     listed = rows_of_globs(given) if table is None else read_table(table)
     with shown_progress() as bars:
         bars.begin("files", len(listed))

@@ -64,17 +64,20 @@ def live(
     plan: Annotated[
         Path | None,
         typer.Option(
-            "--plan", help="a plan into which the page may write; into the file of --rig, too"
+            "--plan",
+            help="a plan to write the exposure into; all else goes into the file of --rig",
         ),
     ] = None,
     host: HostOption = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="port of the page; 0: any that is free")
+    ] = 0,
     read_only: Annotated[
         bool, typer.Option("--read-only", help="the page moves and sets nothing")
     ] = False,
     browser: Annotated[bool, typer.Option("--open", help="open the page in a browser")] = False,
 ) -> None:
-    """Set up the bench on a local page: centre the mask, exposure, align, focus, save.
+    """Set up the bench on a local page: centre the mask, expose, align, focus, save.
 
     It shows the light field too, where Psi is known. Ctrl-C ends.
     """
@@ -132,7 +135,7 @@ def saving_wants(plan: Path | None, rig: str | None) -> str:
     missing = ["`--plan PLAN` (exposure)"] if plan is None else []
     if rig in (None, SIMULATED):
         missing.append("`--rig FILE` (centre, mask, focus)")
-    return f"Saving wants {' and '.join(missing)}." if missing else ""
+    return f"Saving needs {' and '.join(missing)}." if missing else ""
 
 
 @contextmanager
@@ -222,7 +225,7 @@ def _named_devices(stack: ExitStack, camera: str | None, stage: str | None) -> _
     try:
         device = stack.enter_context(closing(open_camera(camera or "ptp:")))
     except UsbNotFoundError as fault:
-        raise AppError(f"{fault}; to look around without one: --rig simulated") from fault
+        raise AppError(f"{fault}; to try the page without a camera: --rig simulated") from fault
     return _Devices(device, None if stage is None else stack.enter_context(open_stage(stage)))
 
 
@@ -251,15 +254,15 @@ def _light_field(
 
     chosen = method or DEFAULT_METHOD
     if find_method(chosen).needs_dictionary:
-        raise AppError(f"--method {chosen} needs a dictionary: choose one that needs none")
+        raise AppError(f"--method {chosen} needs a dictionary: choose a method that needs none")
     if scale is None:
         k = design.sensor.binning
         scale = designed_scale(design.psi((pixels[0] * k, pixels[1] * k)))
     expected = scale.psi.frames_shape[1:]
     if expected != tuple(pixels):
         raise AppError(
-            f"--psi {psi}: for frames of {expected[0]}x{expected[1]} pixels, the camera sends "
-            f"{pixels[0]}x{pixels[1]}"
+            f"--psi {psi}: for frames of {expected[0]}x{expected[1]} pixels, but the camera sends "
+            f"{pixels[0]}x{pixels[1]}: name the Psi of this camera"
         )
     return LiveLightField(scale, chosen)
 

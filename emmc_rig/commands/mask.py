@@ -39,7 +39,7 @@ def mask(
         bool | None,
         typer.Option(
             "--linear/--srgb",
-            help="the picture's coding (default: linear of 16 bits, sRGB of 8)",
+            help="the picture's coding (default: linear with 16 bits, sRGB with 8)",
         ),
     ] = None,
 ) -> None:  # fmt: skip
@@ -54,7 +54,7 @@ def mask(
     at = None if corners is None else _corners(corners)
     with shown_progress("read the mask"):
         if out.suffix.lower() != ".png":
-            raise WrongUsageError(f"--out {out}: name a .png")
+            raise WrongUsageError(f"--out {out}: name a file that ends in .png")
         light = read_photograph(photo, linear)
         wanted = None if ordered is None else read_photograph(ordered, linear=True)
         found = read_mask(light, size, at, wanted)

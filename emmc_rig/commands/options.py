@@ -34,25 +34,33 @@ CameraOption = Annotated[
 ShotsOption = Annotated[
     int | None, typer.Option("--shots", min=1, help="number of shots (default: the camera's own)")
 ]
-SizeOption = Annotated[
+ExportSizeOption = Annotated[
     str | None,
     typer.Option(
         "--size",
         envvar=SIZE_VARIABLE,
-        help="ROWSxCOLUMNS: the middle of a scene; a built-in scene is drawn in that size",
+        help="ROWSxCOLUMNS, pixels, of a scene only (default: the whole)",
     ),
 ]
-ExportSizeOption = Annotated[
-    str | None,
-    typer.Option("--size", envvar=SIZE_VARIABLE, help="ROWSxCOLUMNS, of a scene only"),
+SeedOption = Annotated[
+    int, typer.Option("--seed", min=0, help="seed of the random scene and noise")
 ]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="of the random scene and noise")]
 OutOption = Annotated[Path, typer.Option("--out", help="folder to write")]
 
 
 def out_option(default: str) -> Any:
     """Return the option --out of a command whose default folder depends on its arguments."""
     return typer.Option("--out", help=f"folder to write (default: {default})")
+
+
+def size_option(default: str) -> Any:
+    """Return the option --size of a command that reads scenes."""
+    return typer.Option(
+        "--size",
+        envvar=SIZE_VARIABLE,
+        help="ROWSxCOLUMNS, pixels: the middle of a scene; a built-in scene is drawn in that size "
+        f"(default: {default})",
+    )
 
 
 TruthOption = Annotated[
@@ -77,7 +85,10 @@ ZarrOption = Annotated[
 WorkersOption = Annotated[
     int | None,
     typer.Option(
-        "--workers", min=1, help="processes that share the work", rich_help_panel=PARALLEL_PANEL
+        "--workers",
+        min=1,
+        help="processes that share the work (default: this one; of several captures one a core)",
+        rich_help_panel=PARALLEL_PANEL,
     ),
 ]
 ClusterOption = Annotated[
@@ -93,7 +104,7 @@ DictionaryOption = Annotated[
     typer.Option(
         "--dictionary",
         metavar=NAME_OR_PATH,
-        help="of methods that need one: lambertian, or a file",
+        help="for methods that need a dictionary: lambertian, or a file",
     ),
 ]
 ScenesOption = Annotated[
@@ -101,14 +112,15 @@ ScenesOption = Annotated[
     typer.Option(
         "--scene",
         metavar=NAME_OR_PATH,
-        help="a folder of views, an HDF5 file or a built-in scene's name; may repeat",
+        help="a folder of views, an HDF5 file or a built-in scene's name; may repeat (default: "
+        "built-in scenes)",
     ),
 ]
 MethodsOption = Annotated[
-    list[str] | None, typer.Option("--method", help="only this method; may repeat")
+    list[str] | None, typer.Option("--method", help="only this method; may repeat (default: all)")
 ]
 HostOption = Annotated[
-    str, typer.Option("--host", help="address to serve the page at, for instance for a phone")
+    str, typer.Option("--host", help="address to serve the page at; 0.0.0.0: for a phone, too")
 ]
 StageOption = Annotated[
     str | None,
@@ -126,7 +138,7 @@ RigSceneOption = Annotated[
     typer.Option(
         "--scene",
         metavar=NAME_OR_PATH,
-        help="what its camera looks at, as in `demo`",
+        help="the scene before its camera, as in `demo`",
         rich_help_panel=SIMULATED_PANEL,
     ),
 ]
@@ -135,7 +147,7 @@ RigSizeOption = Annotated[
     typer.Option(
         "--size",
         envvar=SIZE_VARIABLE,
-        help="ROWSxCOLUMNS of the light field",
+        help="ROWSxCOLUMNS of the light field (default: the whole scene)",
         rich_help_panel=SIMULATED_PANEL,
     ),
 ]

@@ -48,7 +48,8 @@ def reconstruct(
     settings: Annotated[
         Path | None,
         typer.Option(
-            "--settings", help="YAML of settings of methods: tv, sparse, adaptive, film, blocks"
+            "--settings",
+            help="YAML file of settings, by method: tv, sparse, adaptive, film, blocks",
         ),
     ] = None,
     truth: TruthOption = None,
@@ -67,13 +68,13 @@ def reconstruct(
         str | None,
         typer.Option(
             "--memory",
-            help="most memory of all processes together, as 2GiB",
+            help="memory of all processes together at most, such as 2GiB (default: no limit)",
             rich_help_panel=PARALLEL_PANEL,
         ),
     ] = None,
     budget: Annotated[
         str | None,
-        typer.Option("--budget", help="choose the most accurate method within a time, as 30s"),
+        typer.Option("--budget", help="choose the most accurate method within a time, such as 30s"),
     ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="exit code 1 where the verdict is: do not use")
@@ -110,7 +111,9 @@ def reconstruct(
             raise typer.BadParameter("a film is reconstructed alone: name one session")
         for name, given in ignored.items():
             if given:
-                raise typer.BadParameter(f"{name}: not of a film; leave it out, or add --frame")
+                raise typer.BadParameter(
+                    f"{name}: no effect on a whole film; leave it out, or choose a frame by --frame"
+                )
         ((_, written),) = _places(captures, out)
         _film(
             films[0], written, strict, method=method or DEFAULT_METHOD, psi_path=psi,
@@ -118,7 +121,9 @@ def reconstruct(
         )  # fmt: skip
         return
     if frame is not None and not (films and len(frames) == 1):
-        raise typer.BadParameter("--frame: is of a film; name one session that holds a film")
+        raise typer.BadParameter(
+            "--frame: chooses a frame of a film; name one session that holds a film"
+        )
     why = None
     if budget is not None:
         if method is not None or settings is not None:
@@ -210,7 +215,8 @@ def _places(captures: Sequence[Capture], out: Path | None) -> list[tuple[Capture
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice and not (out is None and all(capture.own_place for capture in captures)):
         raise typer.BadParameter(
-            f"several captures are named {twice[0]}, and --out has a folder a name: rename one"
+            f"several captures are named {twice[0]}, and --out gets a folder for each name: rename "
+            "one"
         )
     return [
         (capture, (out is None and capture.own_place) or (out or DEFAULT) / name)

@@ -69,7 +69,7 @@ def show(session: Folder) -> None:
     opened = Session(session)
     listed = summary(opened)
     tell(f"{listed.name}: {listed.title}")
-    tell(f"  {'state':<12} {listed.state} after {opened.runs} run(s)")
+    tell(f"  {'state':<12} {listed.state} after {opened.runs} run{'s' * (opened.runs > 1)}")
     tell(f"  {'begun':<12} {listed.created}")
     tell(f"  {'size':<12} {shown_bytes(listed.bytes)}")
     tell(f"  {'frames':<12} {listed.stored} of {listed.planned}")
@@ -83,7 +83,7 @@ def show(session: Folder) -> None:
     leftovers, foreign = opened.unexpected_files()
     if leftovers:
         names = ", ".join(leftovers)
-        tell(f"  {len(leftovers)} leftover(s) of a crash, which do not count: {names}")
+        tell(f"  left over from a crash, not counted: {names}")
     for name in foreign:
         tell(f"  {name}: not part of this session")
     for reason in exposure_reasons(shot_exposures(opened)):
@@ -157,7 +157,7 @@ def sheet(
         Path | None, typer.Option("--out", help="folder to write (default: the session)")
     ] = None,
     pictures: Annotated[
-        int, typer.Option("--pictures", min=0, help="most pictures on the page")
+        int, typer.Option("--pictures", min=0, help="pictures on the page at most")
     ] = 200,
 ) -> None:
     """Write the contact sheet of a session: frames, events and times in one HTML page."""

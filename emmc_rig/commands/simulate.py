@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from emmc_rig.commands.options import (
     DEFAULT_CAMERA,
@@ -13,8 +13,8 @@ from emmc_rig.commands.options import (
     SceneOption,
     SeedOption,
     ShotsOption,
-    SizeOption,
     ZarrOption,
+    size_option,
 )
 from emmc_rig.commands.output import give_result, shown_progress, tell
 
@@ -27,7 +27,7 @@ def simulate(
     camera: CameraOption = DEFAULT_CAMERA,
     shots: ShotsOption = None,
     seed: SeedOption = 0,
-    size: SizeOption = None,
+    size: Annotated[str | None, size_option("the whole; of a built-in scene 192x256")] = None,
     out: OutOption = Path("emmc-frames"),
     as_zarr: ZarrOption = False,
 ) -> None:
@@ -40,8 +40,9 @@ def simulate(
     with result_folder(out, "simulate") as folder, shown_progress("simulate"):
         metrics = simulate_into(folder, scene, camera, described, parse_size(size), seed, as_zarr)
     tell(
-        f"{metrics['shots']} frame(s), sensor PSNR {metrics['sensor_psnr_db']:.2f} dB, light "
-        f"efficiency {metrics['light_efficiency']:.1%}; in {out}"
+        f"{metrics['shots']} frame{'s' * (metrics['shots'] > 1)}, "
+        f"sensor PSNR {metrics['sensor_psnr_db']:.2f} dB, "
+        f"light efficiency {metrics['light_efficiency']:.1%}; in {out}"
     )
     give_result(out)
 

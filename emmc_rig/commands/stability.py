@@ -16,9 +16,9 @@ from emmc_rig.commands.options import (
     OutOption,
     ScenesOption,
     SeedOption,
-    SizeOption,
     WorkersOption,
     check_workers,
+    size_option,
 )
 from emmc_rig.commands.output import give_result, show_study, show_table, shown_progress
 
@@ -27,16 +27,19 @@ def stability(
     scene: ScenesOption = None,
     camera: CameraOption = DEFAULT_CAMERA,
     fault: Annotated[
-        list[str] | None, typer.Option("--fault", help="only this fault; may repeat")
+        list[str] | None, typer.Option("--fault", help="only this fault; may repeat (default: all)")
     ] = None,
     method: Annotated[
         list[str] | None,
-        typer.Option("--method", help="only this method, or `all`; may repeat"),
+        typer.Option(
+            "--method",
+            help="only this method, or `all`; may repeat (default: five; with --fast two)",
+        ),
     ] = None,
     fast: FastOption = False,
     faults: Annotated[bool, typer.Option("--list", help="list the faults, and exit")] = False,
     dictionary: DictionaryOption = None,
-    size: SizeOption = None,
+    size: Annotated[str | None, size_option("96x128; with --fast 36x48")] = None,
     seed: SeedOption = 0,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,

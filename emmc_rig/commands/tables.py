@@ -17,7 +17,7 @@ def tables(
         typer.Option("--scenes", help="a folder of scenes (default: the built-in ones)"),
     ] = None,
     only: Annotated[
-        str | None, typer.Option("--only", help="some of table2, table3, table4; commas between")
+        str | None, typer.Option("--only", help="some of table2,table3,table4 (default: all)")
     ] = None,
     fast: FastOption = False,
     dictionary: DictionaryOption = None,

@@ -126,7 +126,7 @@ def _times(folder: Path) -> tuple[float, tuple[float, ...]]:
         count, rate = int(about["frames"]), float(about["rate"])
         times_s = tuple(float(time_s) for time_s in about["times_s"])
         if not (rate > 0 and count == len(times_s)):
-            raise ValueError(f"{len(times_s)} times of {count} frames at {rate:g} Hz")
+            raise ValueError(f"it states {len(times_s)} times for {count} frames at {rate:g} Hz")
     except (ValueError, KeyError, TypeError) as fault:
         what = f"{folder / METRICS}: not that of a film ({one_line(fault)})"
         raise AppError(f"{what}; {AGAIN}") from fault

@@ -116,8 +116,8 @@ class Format:
         """Write a film; raises AppError as `write_whole`, and where the format has no time."""
         if self.write_film is None:
             raise AppError(
-                f"format {self.name} has no time: choose one for films, or export a single frame, "
-                f"such as {film.first.source}",
+                f"format {self.name} holds no films: choose one that does, or export a single "
+                f"frame, such as {film.first.source}",
                 "list-formats",
             )
         self._refuse_without_parallax(film.first)

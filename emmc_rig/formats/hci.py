@@ -78,7 +78,8 @@ def _read_folder(path: Path) -> Array:
     there = sum(1 for _ in path.glob("input_Cam*.png"))
     if not 0 < rows * columns == there:
         raise AppError(
-            f"{path}: {there} files input_Cam###.png, but {PARAMETERS} says {rows}x{columns}"
+            f"{path}: {there} files input_Cam###.png, but {PARAMETERS} says {rows}x{columns}; "
+            "copy it again"
         )
     paths = [path / f"input_Cam{number:03}.png" for number in range(rows * columns)]
     missing = next((view.name for view in paths if not view.is_file()), None)
@@ -86,7 +87,7 @@ def _read_folder(path: Path) -> Array:
         raise AppError(f"{path}: {missing} is missing; copy it again")
     views = [linear_of(read_picture(view)) for view in paths]
     if len({view.shape for view in views}) > 1:
-        raise AppError(f"{path}: the views differ in size")
+        raise AppError(f"{path}: the views differ in size; copy it again")
     return np.stack(views).reshape(rows, columns, *views[0].shape)[::-1, ::-1]
 
 
@@ -105,7 +106,10 @@ def _read_hdf5(path: Path) -> Array:
     with stored_arrays(path, AppError, "copy it again") as stored:
         pictures = stored.array("LF")
     if pictures.dtype != np.uint8 or pictures.ndim != 5:
-        raise AppError(f"{path}: LF is {pictures.dtype} of shape {pictures.shape}, not 8-bit 4D")
+        raise AppError(
+            f"{path}: LF is {pictures.dtype} of shape {pictures.shape}, where "
+            "HCI's format has 8 bits and (v, u, y, x, colour)"
+        )
     return linear_of(pictures[::-1, ::-1].astype(np.float32) / 255)
 
 

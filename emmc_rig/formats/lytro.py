@@ -41,7 +41,8 @@ def _read_mat(path: Path) -> Array:
         pictures = pictures[..., None]
     if pictures.ndim != 5 or pictures.dtype.kind not in "uf":
         raise AppError(
-            f"{path}: LF is {pictures.dtype} of shape {pictures.shape}, not a light field"
+            f"{path}: LF is {pictures.dtype} of shape {pictures.shape}, where a light "
+            "field has (v, u, y, x, colour)"
         )
     white = np.iinfo(pictures.dtype).max if pictures.dtype.kind == "u" else 1
     light = pictures[..., :3].astype(np.float32) / white
@@ -62,7 +63,10 @@ def _read_eslf(path: Path) -> Array:
     picture = linear_of(read_picture(path))
     height, width, colours = picture.shape
     if not rows or not columns or height % rows or width % columns:
-        raise AppError(f"{path}: {height}x{width} pixels are no {rows}x{columns} views")
+        raise AppError(
+            f"{path}: {height}x{width} pixels cannot be {rows}x{columns} views: "
+            "correct VxU in its name"
+        )
     woven = picture.reshape(height // rows, rows, width // columns, columns, colours)
     return woven.transpose(1, 3, 0, 2, 4)
 

@@ -54,7 +54,7 @@ def read_own(path: Path, name: str = "", apart: Collection[Path] = ()) -> OwnFra
     if path.is_dir():
         if not is_zarr(path):
             raise AppError(
-                f"{shown}: a folder, and no Zarr group: name a file, or the group itself"
+                f"{shown}: a folder without a Zarr group: name a file, or the group itself"
             )
         data, stored = b"", Stored(read_array(path, name))
     else:
@@ -82,7 +82,7 @@ def read_own(path: Path, name: str = "", apart: Collection[Path] = ()) -> OwnFra
 def _stacked(array: NDArray, shown: str) -> NDArray:
     """Return frames, first axis, of what a file holds, without further axes of length 1."""
     if array.dtype.kind not in "uif":
-        raise AppError(f"{shown}: holds no real numbers ({array.dtype})")
+        raise AppError(f"{shown}: holds {array.dtype}, not real numbers: save it as numbers")
     size = "x".join(map(str, array.shape))
     if array.ndim > 2:
         sides = [side for side in array.shape if side != 1]

@@ -37,7 +37,7 @@ def read_photograph(path: Path, linear: bool | None = None) -> NDArray[np.float3
     values = light_of(codes, full_scale)
     values = values[..., :1] if codes.ndim == 2 else values
     if not (values.min() >= 0 and values.max() <= 1):
-        raise AppError(f"{path}: values beyond 0 (black) to 1 (white), or no numbers")
+        raise AppError(f"{path}: values outside 0 (black) to 1 (white), or no numbers: scale them")
     if linear is None:
         linear = full_scale != 255
     return np.asarray(values if linear else linear_of(values), np.float32)

@@ -274,12 +274,12 @@ def _measured(spec: str) -> tuple[np.ndarray, str]:
     order = order_of(light_field) if shows_parallax(axes) else ViewOrder.AS_NAMED
     if order == ViewOrder.AS_NAMED:
         return light_field, described
-    described += f": {order.words}, says their parallax"
+    described += f": {order.words}, as their parallax shows"
     if path != Path(spec):
         return order.arranged(light_field), f"{described}; put right"
     remedy = f"open it as {spec}{BY_PARALLAX} to put them right"
     warnings.warn(
-        f"{spec}: {order.words}, says their parallax; {remedy}", ViewOrderWarning, stacklevel=3
+        f"{spec}: {order.words}, as their parallax shows; {remedy}", ViewOrderWarning, stacklevel=3
     )
     return light_field, described
 
@@ -296,7 +296,7 @@ def _middle(
     if any(w < 1 or w > has for w, has in zip(wanted, light_field.shape[:4], strict=True)):
         raise SceneError(
             f"{spec}: has {has_views[0]}x{has_views[1]} views of {has_size[0]}x{has_size[1]} "
-            f"pixels, cannot give {wanted[0]}x{wanted[1]} of {wanted[2]}x{wanted[3]}"
+            f"pixels, fewer than the {wanted[0]}x{wanted[1]} of {wanted[2]}x{wanted[3]} asked for"
         )
     if wanted == light_field.shape[:4]:
         return light_field, ""

@@ -84,11 +84,15 @@ class MaskGauge:
 
     def _board(self, frame: RawFrame, stage_um: tuple[float, float], shot: int) -> Board:
         if frame.mosaic.shape != self._pixels:
-            raise CalibrationError(f"the frame has not {self._pixels[0]}x{self._pixels[1]} pixels")
+            raise CalibrationError(
+                f"the frame has {frame.mosaic.shape[0]}x{frame.mosaic.shape[1]} pixels instead of "
+                f"{self._pixels[0]}x{self._pixels[1]}: set the camera back to its whole frame"
+            )
         expected = self._camera.sensor.cfa_name
         if frame.cfa != expected:
             raise CalibrationError(
-                f"the camera's colour filters are {frame.cfa}, the design's {expected}"
+                f"the camera's colour filters are {frame.cfa}, the design's {expected}: choose the "
+                "design of this camera"
             )
         if is_dark(frame):
             raise CalibrationError("the picture is dark")

@@ -146,8 +146,9 @@ class LiveLightField:
         expected = self.psi.frames_shape[1:]
         if frame.mosaic.shape != expected:
             raise AppError(
-                f"the Psi is for frames of {expected[0]}x{expected[1]} pixels, the camera sends "
-                f"{frame.mosaic.shape[0]}x{frame.mosaic.shape[1]}"
+                f"the Psi is for frames of {expected[0]}x{expected[1]} pixels, but the camera "
+                f"sends {frame.mosaic.shape[0]}x{frame.mosaic.shape[1]}: name the Psi "
+                "of this camera"
             )
         if shot is None:
             return self._report("the mask is at the place of no shot of this Psi")

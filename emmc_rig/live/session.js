@@ -51,7 +51,7 @@ function drawEnd() {
   const reasons = (verdict?.reasons || []).map((reason) => `${reason.level}: ${reason.what}; ${reason.remedy}`);
   const next = end?.complete ? "reconstruct the light field of session" : "go on with this capture; its session is";
   writeWithCode("end", !end ? `The capture has ended: ${state.why || "see the terminal"}`
-    : [end.complete ? "Complete: every frame verified." : `Stopped: ${end.missing} frames are still to be taken.`,
+    : [end.complete ? "Complete: every frame verified." : `Stopped: ${end.missing} of ${state.planned} frames are still to be taken.`,
       ...reasons, `Next: ${next} \`${end.session}\``].join("\n"));
   $("end").classList.toggle("good", Boolean(end?.complete) && reasons.length === 0);
   $("end").classList.toggle("bad", !end);
@@ -190,7 +190,7 @@ function drawNewest() {
   write("none-yet", state.asked ? "no frame yet: it is taken when that is done" : "waiting for the first frame");
   write("newest", frame ? `${frame.id}: its brightest readings reach ${Math.round(100 * frame.level)}\u00a0% of white` : "");
   write("why", !frame || frame.level > DIM ? "" : frame.kind === "dark" ? "Black, as it should be: the lamp is off while darks are taken."
-    : `Almost black: ${frame.kind === "whiteboard" ? "little light comes through frame pinhole" : "little light comes at this exposure"}.`);
+    : `Almost black: ${frame.kind === "whiteboard" ? "little light comes through one pinhole" : "little light comes at this exposure"}.`);
 }
 
 function show() {

@@ -296,7 +296,7 @@ class Watch:
             self.set_exposure_s(max(chosen_s, shortest_s))
         if under_way is not None and not self._break_off():
             left_s = under_way.left_s()
-            raise AppError(f"this camera ends its exposure before it does anything: {left_s:.0f} s")
+            raise AppError(f"this camera does nothing else while it exposes: wait {left_s:.0f} s")
 
     @property
     def _exposure_s(self) -> float:
@@ -357,7 +357,9 @@ class Watch:
     def centre(self) -> None:
         """Bring masks and aperture to where they are centred, homing first what is not homed."""
         if not self._centre_um:
-            raise AppError("it is not known where the masks are centred: name zero_um in the rig")
+            raise AppError(
+                "it is not known where the mask is centred: name zero_um in the rig's file"
+            )
 
         def home(stage: Stage) -> None:
             unknown = [axis for axis in self._centre_um if not stage.is_homed(axis)]

@@ -244,7 +244,8 @@ class Camera(Settings):
         have = len(self.shots)
         if count > have and self.more_shots_step_um is None:
             raise CameraError(
-                f"'{self.title}' has {have} shot(s) and no 'more_shots_step_um' to make {count}"
+                f"'{self.title}' has {have} shot{'s' * (have > 1)}, not {count}: ask for fewer, or "
+                "write more_shots_step_um into its file"
             )
         steps = self.more_shots_step_um or {}
 

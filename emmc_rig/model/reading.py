@@ -180,7 +180,7 @@ class StoredArrays:
             blank = found.attrs.get(key)
             invalid = 0 if blank is None else int(np.count_nonzero(values == blank))
             if invalid:
-                raise ValueError(f"'{name}' has {invalid} value(s) that its {key} calls not valid")
+                raise ValueError(f"'{name}' has values that its {key} calls not valid: {invalid}")
         return values
 
     def part(self, name: str, index: Any) -> NDArray:

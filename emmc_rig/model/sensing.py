@@ -191,9 +191,13 @@ class Psi(PsiLayout):
         if self.colour is not None:  # kernels are compiled for one layout
             object.__setattr__(self, "colour", np.array(self.colour, order="C", copy=None))
         if self.size[0] % self.binning or self.size[1] % self.binning:
-            raise SensingError(f"pixels of {self.binning}^2 samples do not divide {self.size}")
+            raise SensingError(
+                f"pixels of {self.binning}x{self.binning} samples do not divide {self.size}"
+            )
         if not all(np.isfinite(plane).all() for plane in self.view_planes()):
-            raise SensingError("Psi has entries that are not finite")
+            raise SensingError(
+                "Psi has entries that are not finite: give numbers, or measure it again"
+            )
 
     def __repr__(self) -> str:
         shots, (v, u), (rows, columns) = self.shots, self.views, self.size

@@ -248,7 +248,7 @@ class FilmJob:
             scale = capture.scale(psi_path, watcher)
             psi = scale.psi if given is None else given
             if psi.frames_shape != scale.psi.frames_shape:
-                raise AppError(f"{psi_path}: is not of this session's shots and frames")
+                raise AppError(f"{psi_path}: not of this session's shots and frames; name its own")
             if not is_one_block(psi.size, self.settings):
                 raise AppError(
                     f"frames of {'x'.join(map(str, psi.size))} are more than one block, and films "

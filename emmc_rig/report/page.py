@@ -105,7 +105,7 @@ def estimated(metrics: Mapping[str, object]) -> list[str]:
     sentences = [f"{assumed}."] if assumed else []
     if isinstance(found, list) and found:
         words = "; ".join(map(str, found))
-        sentences.append(f"Estimated from the frames, as nobody gave it: {words}.")
+        sentences.append(f"Not given, so estimated from the frames: {words}.")
     if unmeasured := unmeasured_words(metrics):
         sentences.append(f"{unmeasured}.")
     return sentences

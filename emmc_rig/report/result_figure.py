@@ -127,7 +127,9 @@ def draw_results(
                 f"{reference.shape}: name results of one capture"
             )
     if any(result.view_axes != axes for result in results):
-        raise AppError("views are angles of one result, bands or times of another")
+        raise AppError(
+            "views are angles of one result, bands or times of another: name results of one capture"
+        )
     parallax, (rows_of_views, columns_of_views) = shows_parallax(axes), reference.shape[:2]
     view = _view(reference, settings.view)
     pieces = _pieces(reference[view], settings)
@@ -358,7 +360,9 @@ def _view(light_field: Array, chosen: tuple[int, int] | None) -> tuple[int, int]
     rows, columns = light_field.shape[:2]
     view = chosen or (rows // 2, columns // 2)
     if not (0 <= view[0] < rows and 0 <= view[1] < columns):
-        raise WrongUsageError(f"view {view[0]},{view[1]}: there are {rows}x{columns} views")
+        raise WrongUsageError(
+            f"view {view[0]},{view[1]}: there are {rows}x{columns} views, counted from 0"
+        )
     return view
 
 
@@ -367,10 +371,12 @@ def _pieces(picture: Array, settings: FigureSettings) -> list[Piece]:
     height, width = picture.shape[:2]
     side = settings.side_px or max(8, round(CLOSE_UP_SHARE * width))
     if side > min(height, width):
-        raise WrongUsageError(f"side {side}: the pictures have {height}x{width} pixels")
+        raise WrongUsageError(f"side {side}: the pictures have only {height}x{width} pixels")
     for y, x in settings.at:
         if not (0 <= y < height and 0 <= x < width):
-            raise WrongUsageError(f"at {y},{x}: the pictures have {height}x{width} pixels")
+            raise WrongUsageError(
+                f"at {y},{x}: the pictures have {height}x{width} pixels, counted from 0"
+            )
     corners = [
         (min(max(y - side // 2, 0), height - side), min(max(x - side // 2, 0), width - side))
         for y, x in settings.at

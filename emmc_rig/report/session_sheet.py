@@ -304,4 +304,4 @@ def events(session: Session) -> Iterator[tuple[str, str]]:
         if text := str(entry):
             yield entry.kind, text
     if session.journal.unreadable:
-        yield "torn", f"{session.journal.unreadable} journal line(s) do not count"
+        yield "torn", f"damaged lines of the journal, not counted: {session.journal.unreadable}"

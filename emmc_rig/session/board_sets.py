@@ -130,7 +130,9 @@ def exposure_of(session: Session, frame: PlannedFrame) -> float:
     """Return how long a frame was exposed; raises AppError where it was not captured yet."""
     entry = session.stored.get(frame.id)
     if entry is None:
-        raise AppError(f"{session.folder}: frame {frame.id} was not captured yet; resume it")
+        raise AppError(
+            f"{session.folder}: frame {frame.id} was not captured yet; resume the capture"
+        )
     return entry.exposure_s
 
 

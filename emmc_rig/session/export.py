@@ -57,7 +57,7 @@ def export_hdf5(
     if missing:
         raise AppError(
             f"{session.folder}: {len(missing)} of {len(session.needed)} frames are missing; "
-            "resume it first",
+            "resume the capture first",
             "capture",
             session.folder,
         )
@@ -96,7 +96,7 @@ def export_dng(session: Session, folder: Path, watcher: Watcher | None = None) -
     watcher = watcher or Watcher()
     frames = [frame for frame in session.frames if frame.id in session.stored]
     if not frames:
-        raise AppError(f"{session.folder}: no frame was captured yet; resume it")
+        raise AppError(f"{session.folder}: no frame was captured yet; resume the capture")
     runs = of_kind(session.journal.entries, RunEntry)
     imported = bool(of_kind(session.journal.entries, ImportedEntry))
     with result_folder(folder, "session export --dng") as new:

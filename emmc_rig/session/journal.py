@@ -235,7 +235,7 @@ class MeteredEntry(TimedEntry):
             f"shot{'s' * (len(shots) > 1)} {', '.join(shots)} exposure {exposure_s:.3g} s"
             for exposure_s, shots in by_exposure.items()
         )
-        longer = f"; {len(self.asked)} longer frames for the dark parts" if self.asked else ""
+        longer = f"; longer frames for the dark parts: {len(self.asked)}" if self.asked else ""
         return f"{exposures}{longer}"
 
 
@@ -284,7 +284,7 @@ class DecidedEntry(TimedEntry):
             f"dB, target {self.target_db:g} dB"
         )
         if self.next is None:
-            spared = f", {len(self.spared)} shots not needed" if self.spared else ""
+            spared = f", shots not needed: {len(self.spared)}" if self.spared else ""
             return f"{stated}; done, {self.why}{spared}"
         return f"{stated}; next shot {self.next + 1}{f', {self.why}' if self.why else ''}"
 

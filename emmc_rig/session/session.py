@@ -354,14 +354,20 @@ class Session:
         """
         entry = self.stored.get(frame_id)
         if entry is None:
-            raise AppError(f"{self.folder}: frame {frame_id} was not captured yet; resume it")
+            raise AppError(
+                f"{self.folder}: frame {frame_id} was not captured yet; resume the capture"
+            )
         path = self.path_of(entry)
         try:
             data = self.disk.read(path)
         except OSError as fault:
-            raise AppError(f"{path}: cannot be read ({fault.strerror}); resume it") from fault
+            raise AppError(
+                f"{path}: cannot be read ({fault.strerror}); resume the capture"
+            ) from fault
         if hashlib.sha256(data).hexdigest() != entry.sha256:
-            raise AppError(f"{path}: is damaged, its SHA-256 is not the journal's; resume it")
+            raise AppError(
+                f"{path}: is damaged, its SHA-256 is not the journal's; resume the capture"
+            )
         return data
 
     def store(self, frame: PlannedFrame, file: FrameFile, entry: Callable[[], FrameEntry]) -> None:

@@ -60,14 +60,13 @@ class Verdict:
             shown = ", ".join(self.missing[:5]) + (", ..." if len(self.missing) > 5 else "")
             yield f"{len(self.missing)} of {self.planned} frames not captured yet: {shown}"
         if self.spared:
-            yield f"{self.spared} more frame(s) planned, which were not needed for the PSNR"
+            yield f"not needed for the PSNR: {self.spared} more of the planned frames"
         if self.dropped:
-            yield f"{self.dropped} frame(s) of the film dropped, each named in the journal"
+            yield f"dropped from the film: {self.dropped} of its frames, named in the journal"
         if self.unreadable:
-            yield f"{self.unreadable} journal line(s) torn or damaged; their frames do not count"
+            yield f"damaged lines of the journal, whose frames do not count: {self.unreadable}"
         if self.leftovers:
-            count, shown = len(self.leftovers), ", ".join(self.leftovers)
-            yield f"{count} leftover(s) of a crash, which do not count: {shown}"
+            yield f"left over from a crash, not counted: {', '.join(self.leftovers)}"
         for name in self.foreign:
             yield f"{name}: not part of this session"
 

@@ -208,9 +208,9 @@ def refuse_filled(out: Path) -> None:
     """Raise AppError unless the folder is missing or empty."""
     try:
         if out.exists() and not out.is_dir():
-            raise AppError(f"{out}: a file, where a folder is meant; name another")
+            raise AppError(f"{out}: a file of that name exists; choose another folder")
         if out.exists() and any(out.iterdir()):
-            raise AppError(f"{out}: holds something already; name another folder")
+            raise AppError(f"{out}: holds something already; choose another folder")
     except OSError as fault:
         raise AppError(f"{out}: cannot be read ({fault.strerror or fault})") from fault
 
@@ -296,7 +296,7 @@ def _replaceable(folder: Path, out: Path, command: str, adds: bool) -> Listing:
     if earlier is None:
         if not adds and any(path.name != PARTIAL for path in folder.iterdir()):
             raise AppError(
-                f"{out}: the folder holds something else than an earlier result; choose "
+                f"{out}: the folder holds something other than an earlier result; choose "
                 "another folder or empty it"
             )
         return Listing(command)

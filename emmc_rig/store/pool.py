@@ -184,7 +184,8 @@ class Processes(Pool):
                     )
                     raise WorkersError(
                         f"one worker alone needs more memory than the{limit} there is: allow more, "
-                        "or set smaller blocks (blocks: side, whole); the same command goes on"
+                        "or set smaller blocks (blocks: side, whole), and run the same "
+                        "command again to go on"
                     ) from fault
                 self.size -= 1
             elif isinstance(fault, BrokenProcessPool):
@@ -192,8 +193,8 @@ class Processes(Pool):
                 if self._losses_in_a_row >= MOST_LOSSES:
                     raise WorkersError(
                         f"workers were killed {self._losses_in_a_row} times in a row, as when "
-                        "memory runs out: take fewer workers, or set a limit of memory; the same "
-                        "command goes on"
+                        "memory runs out: take fewer workers, or set a limit of memory, and run "
+                        "the same command again to go on"
                     ) from fault
             else:
                 raise fault
@@ -286,7 +287,8 @@ class Cluster(Pool):
 
     def _mend(self, executor: Executor, fault: BaseException) -> None:
         raise WorkersError(
-            f"cluster {self._address}: lost ({one_line(fault)}); the same command goes on"
+            f"cluster {self._address}: lost ({one_line(fault)}): run the same command "
+            "again to go on"
         ) from fault
 
     def run(

@@ -58,7 +58,7 @@ def study_folder(out: Path, journal: str, command: str) -> Iterator[Path]:
     known = (folder / journal).is_file() or Listing.read(folder) is not None
     if folder.is_dir() and any(folder.iterdir()) and not known:
         raise AppError(
-            f"{out}: the folder holds something else than an earlier {command}; "
+            f"{out}: the folder holds something other than an earlier {command}; "
             "choose another folder or empty it"
         )
     with kept_words(out, lambda: "what was measured is"):

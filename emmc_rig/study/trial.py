@@ -130,7 +130,7 @@ def method_inputs(name: str, dictionary: str | None) -> dict[str, object]:
     """
     method = METHODS[name]
     if not method.installed:
-        raise NotApplicableError(f"{method.name} needs {method.package}: not installed")
+        raise NotApplicableError(f"{method.name} needs {method.package}, which is not installed")
     return {
         "machine": machine(),
         "method": method.name,

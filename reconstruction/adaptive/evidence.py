@@ -101,7 +101,7 @@ class EvidencePatches:
         if min(pixels) < span:
             raise ReconstructionError(
                 f"patches of {span} pixels do not fit a sensor of {pixels[0]}x{pixels[1]}: "
-                "use a larger window"
+                "reconstruct a larger part"
             )
         along = [
             np.unique([0, *range(first, whole - span + 1, self.stride), whole - span])

@@ -196,7 +196,7 @@ class Film:
         if before.size != psi.size:
             raise ReconstructionError(
                 f"frames before were of {'x'.join(map(str, before.size))} samples, this Psi is of "
-                f"{'x'.join(map(str, psi.size))}"
+                f"{'x'.join(map(str, psi.size))}: use the Psi of the film"
             )
         if np.array_equal(before.weights, psi.weights):
             return []

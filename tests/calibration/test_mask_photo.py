@@ -340,7 +340,7 @@ def test_nothing_is_written_over(tmp_path, run):
         (("photo.tif", "--cells", "40", *MASK[2:]), 2, "write ROWSxCOLUMNS"),
         (("photo.tif", "--cells", "40x60", *MASK[2:]), 1, "about 40x52 cells"),
         (("photo.tif", *MASK, "--corners", "1,2 3,4"), 2, "write four points"),
-        (("photo.tif", *MASK[:5], "mine.jpg"), 2, "name a .png"),
+        (("photo.tif", *MASK[:5], "mine.jpg"), 2, "name a file that ends in .png"),
         (("photo.tif", *MASK, "--ordered", "photo.tif"), 1, "as ordered has 520x676 cells"),
         (("photo.tif", *MASK[:5], "none/mine.png"), 1, "none"),
     ],

@@ -99,11 +99,11 @@ def without_a_view(boards, design):
 REFUSED = {
     "saturated": (averaged(flat(WHITE_DN)), r"100.0% of the pixels are saturated; shorten"),
     "flickering": (averaged(flat(), flat(10_500)), r"differ by 4\.8% in .*; the lamp flickers"),
-    "two sizes": (averaged(flat(), flat(size=(20, 21))), "differ"),
+    "two sizes": (averaged(flat(), flat(size=(20, 21))), "capture all alike"),
     "no frames": (averaged(), "no frame was taken"),
     "a view missing": (without_a_view, r"missing: shot 0, view \(1, 2\), white lamp"),
     "no reference": (with_references({}), "no reference whiteboard"),
-    "a dark reference": (with_references({(0, "white"): seen(20)}), "raise the lamp or the exp"),
+    "a dark reference": (with_references({(0, "white"): seen(20)}), "brighten the lamp or exp"),
     "no repeats": (lambda *_: photon_transfer(seen(0, np.nan, 1), seen(0)), "at least two"),
     "no light": (lambda *_: photon_transfer(seen(0), seen(0)), "is the lamp on"),
 }

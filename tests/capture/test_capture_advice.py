@@ -466,7 +466,7 @@ def no_plan(bench):
     bench.plan(camera=written["camera"])
 
 
-@walk("holds something else than a session; name another folder")
+@walk("holds something other than a session; name another folder")
 def a_folder_of_something_else(bench):
     (bench.folder / "mine").mkdir()
     (bench.folder / "mine" / "thesis.txt").write_text("mine")

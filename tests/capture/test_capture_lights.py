@@ -153,6 +153,6 @@ def test_the_command_lists_and_switches_lights_and_says_what_is_wrong(run, tmp_p
         run("devices", "lights", "pink", "--rig", rig)
     )
     rig.write_text("camera: simulated\n")
-    assert "has no lights: part" in refused(run("devices", "lights", "off", "--rig", rig))
+    assert "names no lights" in refused(run("devices", "lights", "off", "--rig", rig))
     rig.write_text("kind: simulated\nlights: {protocol: mm, port: x, shutter: y}\n")
     assert "write lights: simulated" in refused(run("devices", "lights", "off", "--rig", rig))

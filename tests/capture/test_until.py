@@ -87,7 +87,7 @@ def session_until(folder, target, reason):
 def enough(tmp_path_factory):
     """A session that needed one shot of three."""
     folder = tmp_path_factory.mktemp("enough")
-    return session_until(folder, "12dB", "the target is reached, 2 shots not needed")
+    return session_until(folder, "12dB", "the target is reached, shots not needed: 2")
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_a_session_ends_when_the_scene_needs_no_more_shots(enough):
 
 def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough):
     out = done(program("session", "verify", enough))
-    assert "2 more frame(s) planned, which were not needed" in out
+    assert "not needed for the PSNR: 2 more of the planned frames" in out
     _, out, _ = program("session", "show", enough)
     assert "shot         1 of 1" in out
     assert "target 12 dB; done, the target is reached" in out

@@ -3,11 +3,11 @@
 import ast
 import re
 from functools import cache
-from pathlib import Path
 from typing import get_args
 
 import pytest
 import typer
+from words import PRODUCT, ROOT, texts
 
 from emmc_rig import cli
 from emmc_rig.commands.output import WORDS, free_command, in_shell, naming_stage, on_stage
@@ -22,11 +22,9 @@ from emmc_rig.drivers.errors import (
 from emmc_rig.errors import AppError
 from emmc_rig.model.errors import Advice
 
-ROOT = Path(__file__).parents[2]
 COMMANDS = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
-PRODUCT = ("reconstruction", "calibration", "drivers", "simulators", "emmc_rig")
 OURS = ("emmc_rig/commands/", "emmc_rig/cli.py")
-TYPED = re.compile(rf"emmc-rig (?:{'|'.join(COMMANDS)})\b|`emmc-rig $|(?<![\w-])--[a-z]")
+TYPED = re.compile(rf"emmc-rig (?:{'|'.join(COMMANDS)})\b|`emmc-rig {{|(?<![\w-])--[a-z]")
 SHOWN = {
     "emmc_rig/bench/conformance/named.py": "the option is pytest's",
     "emmc_rig/store/results.py": "the flags are git's",
@@ -44,15 +42,6 @@ OF_OTHERS = re.compile(r"(udevadm|systemctl|gphoto2)[a-z ]* --[a-z-]+")
 """Commands of other programs."""
 
 
-def string_literals(path):
-    """Yield line and text of every string of a file; what stands alone documents the code."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in alone:
-            yield node.lineno, node.value
-
-
 @cache
 def mentions():
     """Return file, line and text of strings of the library that name a command or flag."""
@@ -60,7 +49,7 @@ def mentions():
     for path in (path for folder in PRODUCT for path in sorted((ROOT / folder).rglob("*.py"))):
         name = path.relative_to(ROOT).as_posix()
         if not name.startswith(OURS):
-            for line, text in string_literals(path):
+            for line, _, text in texts(ast.parse(path.read_text(encoding="utf-8"))):
                 if TYPED.search(OF_OTHERS.sub("", text)):
                     found.append((name, line, text))
     return found

@@ -63,7 +63,7 @@ def test_a_folder_of_views_is_imaged(run, tmp_path):
     camera = {"title": "a camera", "views": [2, 2], "sensor": {"cfa": "rggb"}, "masks": {"m": mask}}
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(camera))
     out = done(run("simulate", "--scene", "views", "--camera", "c.yaml", "--out", "r"))
-    assert "1 frame(s)" in out
+    assert "1 frame, " in out
 
 
 def test_version_and_help_are_printed(run):
@@ -113,7 +113,19 @@ def test_each_help_ends_with_two_examples_that_can_be_typed(run):
             command.make_context(" ".join(words), typed).close()
     assert not unused
     out = done(run("devices", "jog", "-h"))
-    assert out.rstrip().endswith("emmc-rig devices jog x --to 12000 --rig bench.yaml")
+    assert out.rstrip().endswith("emmc-rig devices jog x --to 12000 --stage bench.yaml")
+
+
+@pytest.mark.parametrize("line", [x for x in EXAMPLES if x.startswith("devices") and "--rig" in x])
+def test_examples_with_the_simulated_rig_run(run, line):
+    done(run(*shlex.split(line)))
+
+
+@pytest.mark.parametrize("camera", [x.split()[3] for x in EXAMPLES if "camera --camera" in x])
+def test_examples_name_cameras_that_there_are(run, camera):
+    code, _, err = run("devices", "camera", "--camera", camera)
+    assert code == 1
+    assert "no such camera driver" not in err
 
 
 def _wrong(words, err):

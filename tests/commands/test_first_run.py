@@ -44,7 +44,7 @@ def test_other_processes_compile_meanwhile_and_end_with_the_run(started, capsys)
         assert [process.poll() for _, process in started] == [None] * 3
     assert all(process.poll() is not None for _, process in started)
     assert parts(started) == [[part, "rgbw-mono", "2"] for part in first_run.PARTS["adaptive"]]
-    assert capsys.readouterr().err.count("compiling kernels for this machine, once") == 1
+    assert capsys.readouterr().err.count("compiling the methods for this machine, once") == 1
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_where_nothing_is_kept_that_is_said_and_no_process_is_started(started, m
     with first_run.helped_to_compile("adaptive", "rgbw-mono", None):
         assert fifth(5.0) == 1
     assert not started
-    assert "as every run here: no folder to keep them" in capsys.readouterr().err
+    assert "in every run: no folder to keep it" in capsys.readouterr().err
 
 
 def test_where_no_process_can_be_started_the_run_compiles_alone(monkeypatch):

@@ -321,11 +321,11 @@ MISTAKES = {
     "another depth": (written(1, (LIT[1] >> 8).astype(np.uint8)), "8 bits a pixel"),
     "floats beside integers": (written(1, LIT[1].astype(np.float32)), "values of float32, and"),
     "whole numbers with a sign": (written(1, LIT[1].astype(np.int32)), "values of int32, and"),
-    "a NaN": (nan_pixel, "1 pixel(s) are no numbers"),
+    "a NaN": (nan_pixel, "pixels that are no numbers (NaN or infinite): 1; correct"),
     "below zero": (written(1, LIT[1].astype(np.int32) - 30_000), "black level still in them"),
     "above white": (written(1, LIT[1].astype(np.uint32) * 2), "above sensor.noise.white_level_dn"),
-    "complex values": (written(1, LIT[1] * 1j), "holds no real numbers"),
-    "truths": (written(1, LIT[1] > 9), "holds no real numbers"),
+    "complex values": (written(1, LIT[1] * 1j), "not real numbers: save it as numbers"),
+    "truths": (written(1, LIT[1] > 9), "not real numbers: save it as numbers"),
     "a line of values": (written(1, LIT[1].ravel()), "not frames (y, x) or (frame, y, x)"),
     "five axes": (written(1, LIT[:2, None].repeat(2, 1)[None]), "1x2x2x24x32, not frames (y, x)"),
     "nothing in it": (written(1, LIT[1][:0]), "holds an array of 0x32"),
@@ -339,7 +339,7 @@ MISTAKES = {
     "a torn picture": (file_written(1, "e.png", b"\x89PNG\r\n\x1a\n123"), "cut short or damaged"),
     "a torn DNG": (file_written(1, "e.dng", b"II*\x00123"), "e.dng: unusable RAW frame"),
     "no MAT": (file_written(1, "e.mat", b"MATLAB"), "e.mat: cannot be read"),
-    "a folder": (changed(1, file="."), "no Zarr"),
+    "a folder": (changed(1, file="."), "without a Zarr group"),
     "wrong colours": (raw_file(1, "bggr"), "its colours are bggr, the camera's sensor.cfa is rggb"),
     "another exposure": (raw_file(1, exposure_s=0.05), "exposure_s 0.02, but its file states 0.05"),
     "ms for s of an OME-TIFF": (ome, "exposure_s 20, but its file states 0.02 s: ms for s?"),
@@ -405,7 +405,7 @@ MISTAKES = {
         changed(2, kind="reference", exposure_s=""), "its exposure is not known"
     ),
     "an array that is not there": (changed(0, file="s0.npz@a"), "s0.npz: no such file"),
-    "more shots than the camera has": (third_shot, "and the camera has 2 shot(s): write mask_x_um"),
+    "more shots than the camera has": (third_shot, "and the camera has 2 shots: write mask_x_um"),
     "nm for um of the mask": (changed(1, mask_x_um=24_000), "mask at 24000, 0 um: nm for um?"),
     "mm for um of a whiteboard's mask": (
         changed(2, kind="open", mask_x_um=0.024), "mm for um? write um"
@@ -640,7 +640,7 @@ def test_a_file_that_goes_while_it_is_imported_is_named(then, words, tmp_path, r
 
 
 OUTS = {
-    "s0.npy": "a file, where a folder is meant",
+    "s0.npy": "a file of that name exists",
     "s0.npy/out": "cannot be made",
     ".": "holds something already",
     "/proc/out": "/proc/out",
@@ -658,7 +658,7 @@ def test_a_place_that_cannot_be_written_is_named(out, tmp_path, run):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--shots", "x*.npy"), "x*.npy: no file is called so (shot)"),
+        (("--shots", "x*.npy"), "x*.npy: no file of that name or pattern (shot)"),
         (("--shots", "*.npy", "--darks", "d*.npy"), "is there twice"),
         (("--shots", "s*.npy", "--planes"), "the camera's sensor.cfa is rggb"),
         (("table.xlsx",), "table.xlsx: no such file"),

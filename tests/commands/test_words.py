@@ -6,11 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import words
 
-ROOT = Path(__file__).parents[2]
-SAYS = (
-    "emmc_rig", "drivers", "calibration", "reconstruction", "simulators", "docs", "README.md",
-)  # fmt: skip
+SAYS = (*words.PRODUCT, "docs", "README.md")
 MADE = ("docs/_build", "docs/gallery", "docs/command-line.md")
 """Folders and files in SAYS that a script makes: not searched."""
 REPLACED = {
@@ -51,6 +49,8 @@ SAID = {
 }
 """By the end of a file's name, what of it is read by users; of Python code strings are."""
 TEMPLATE = re.compile(r"\{[{%#].*?[}%#]\}", re.DOTALL)
+FIELD = re.compile(r"\{[^{}]*\}")
+"""Of an f-string: its name is the code's."""
 ANY = re.compile("|".join(REPLACED), re.IGNORECASE)
 KEY = re.compile(r"-{0,2}[a-z][a-z0-9_.-]*")
 """A name that files and scripts know, which stays: not a text."""
@@ -60,21 +60,13 @@ def texts(path: Path) -> Iterator[tuple[int, str]]:
     """Yield what a file says to users, with its line; docstrings only of commands: their help."""
     if path.suffix == ".py":
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        documents = set() if path.parent.name == "commands" else docstrings(tree)
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Constant) and node not in documents:
-                yield node.lineno, str(node.value)
+        for line, _, text in words.texts(tree, documents=path.parent.name == "commands"):
+            yield line, FIELD.sub("{}", text)
     elif path.suffix in SAID:
         text = path.read_text(encoding="utf-8")
         text = TEMPLATE.sub(lambda code: "\n" * code[0].count("\n"), text)
         for found in re.finditer(SAID[path.suffix], text):
             yield text.count("\n", 0, found.start()) + 1, " ".join(found[0].strip('<>`"').split())
-
-
-def docstrings(tree: ast.Module) -> set[ast.Constant]:
-    """Return the strings that stand alone: docstrings, and those of constants."""
-    alone = (node.value for node in ast.walk(tree) if isinstance(node, ast.Expr))
-    return {node for node in alone if isinstance(node, ast.Constant)}
 
 
 def returned(path: Path) -> list[str]:
@@ -90,7 +82,7 @@ def returned(path: Path) -> list[str]:
 
 def files(name: str) -> list[Path]:
     """Return the files of a folder, or the file."""
-    place = ROOT / name
+    place = words.ROOT / name
     return (
         [path for path in sorted(place.rglob("*")) if path.is_file()] if place.is_dir() else [place]
     )
@@ -98,7 +90,7 @@ def files(name: str) -> list[Path]:
 
 @pytest.mark.parametrize("name", SAYS)
 def test_no_word_that_was_replaced_is_said_again(name):
-    skipped = [ROOT / place for place in MADE]
+    skipped = [words.ROOT / place for place in MADE]
     found = [
         line
         for path in files(name)
@@ -120,6 +112,19 @@ def test_no_word_that_was_replaced_is_said_again(name):
 def test_a_word_that_comes_back_is_found(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     assert returned(tmp_path / name)
+
+
+def test_the_list_for_reading_has_helps_and_texts_of_python_and_of_pages(capsys, monkeypatch):
+    files = ("emmc_rig/captures/run.py", "emmc_rig/commands/devices.py", "emmc_rig/live/page.html")
+    monkeypatch.setattr("sys.argv", ["words.py", *(str(words.ROOT / name) for name in files)])
+    words.main()
+    out = capsys.readouterr().out
+    assert "[raise] {request.out}: holds something other than a session; name another" in out
+    assert "[tell] no serial port: plug a stage in, or try --rig simulated" in out
+    assert 'aria-label="what is shown"' in out
+    assert "test_" not in out
+    helps = dict(words.helps())
+    assert "Home the axes of a stage" in helps["emmc-rig devices home"]
 
 
 def test_keys_of_files_and_what_is_said_of_the_code_are_not_taken_for_words(tmp_path):

@@ -138,11 +138,14 @@ def test_a_program_confirms_by_its_exit_code_within_its_time():
     [
         ({"colours": {"off": {"send": "o"}}}, r"colours\.off\.expect"),
         ({"colours": {"off": {"send": "o", "expct": "k"}}}, "did you mean 'expect'"),
-        ({"colours": {"pink": {"send": "o", "expect": "k"}}}, "pink is no colour of lights: use"),
+        (
+            {"colours": {"pink": {"send": "o", "expect": "k"}}},
+            "pink is not a colour of the lights: use",
+        ),
         ({"colours": {"white": {"send": "o", "expect": "k"}}}, "under off:"),
         ({"bauds": 9600}, "did you mean 'baud'"),
         ({"protocol": "txt"}, "must be one of text, command, mm"),
-        ({"protocol": "mm", "colours": {}}, "name the label of a shutter: or of a state device:"),
+        ({"protocol": "mm", "colours": {}}, "write shutter: or device:"),
         ({"protocol": "mm", "device": "LED", "colours": {}}, "go together"),
     ],
 )

@@ -73,7 +73,7 @@ def drop_frames(folder):
     ("damage", "words"),
     [
         (cut_metrics, "metrics.json: cannot be read"),
-        (drop_times, "5 times of 6 frames"),
+        (drop_times, "5 times for 6 frames"),
         (drop_film, "metrics.json: not that of a film"),
         (drop_frames, "a film without a frame"),
     ],
@@ -173,7 +173,7 @@ def test_the_command_exports_a_film_and_says_what_a_film_is_not_for(tmp_path, mo
     code, _, err = program("export", film.folder, "--format", "hci", "--out", "hci")
     assert code == 1
     said = one_line(err)
-    assert "choose one for films" in said
+    assert "holds no films: choose one that does" in said
     assert said.endswith("`emmc-rig export --list` marks them")
     assert "frames/000000" in said
     assert not (tmp_path / "hci").exists()

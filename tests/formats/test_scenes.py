@@ -57,8 +57,8 @@ def test_of_a_measured_scene_the_middle_is_cut(tmp_path, measured):
 
 
 MISTAKES = [
-    (lambda: open_scene("lf.h5", size=(21, 26)), "has 3x3 views of 20x26 pixels, cannot give"),
-    (lambda: open_scene("lf.h5", views=(3, 4)), "has 3x3 views of 20x26 pixels, cannot give"),
+    (lambda: open_scene("lf.h5", size=(21, 26)), "has 3x3 views of 20x26 pixels, fewer than"),
+    (lambda: open_scene("lf.h5", views=(3, 4)), "has 3x3 views of 20x26 pixels, fewer than"),
     (lambda: open_scene("near-planar", size=(0, 5)), "it takes rows and columns"),
     (lambda: open_scene("near-plana"), f"did you mean 'near-planar'.*{'.*'.join(SCENES)}"),
     (lambda: open_scene("lf.txt"), r"ends in \.h5, \.hdf5 or \.mat"),

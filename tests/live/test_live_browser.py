@@ -27,7 +27,7 @@ from selenium.webdriver.common.keys import Keys
 pytestmark = MARKS
 
 TOKEN = "a-secret"
-WANTS = "Saving wants `--plan PLAN` (exposure)."
+WANTS = "Saving needs `--plan PLAN` (exposure)."
 WIDTH = "return document.getElementById('viewer-picture').width"
 
 

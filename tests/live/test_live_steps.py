@@ -39,10 +39,10 @@ shots:
         (
             None,
             None,
-            "Saving wants `--plan PLAN` (exposure) and `--rig FILE` (centre, mask, focus).",
+            "Saving needs `--plan PLAN` (exposure) and `--rig FILE` (centre, mask, focus).",
         ),
-        (None, "rig.yaml", "Saving wants `--plan PLAN` (exposure)."),
-        (Path("plan.yaml"), "simulated", "Saving wants `--rig FILE` (centre, mask, focus)."),
+        (None, "rig.yaml", "Saving needs `--plan PLAN` (exposure)."),
+        (Path("plan.yaml"), "simulated", "Saving needs `--rig FILE` (centre, mask, focus)."),
         (Path("plan.yaml"), "rig.yaml", ""),
     ],
 )

@@ -138,7 +138,7 @@ def test_a_scheduler_that_is_killed_is_one_line(monkeypatch, tmp_path):
             done = pool.run(time.sleep, [0.0, 600.0])
             assert next(done)[0] == 0.0
             parts[0].kill()
-            with pytest.raises(WorkersError, match=r"lost .*the same command goes on"):
+            with pytest.raises(WorkersError, match=r"lost .*run the same command again"):
                 next(done)
     finally:
         for part in parts:

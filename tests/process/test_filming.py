@@ -297,8 +297,8 @@ def test_the_command_says_how_a_film_went_and_where_it_is_worst(session, run):
     ("options", "what"),
     [
         (["--method", "tv"], "'tv' takes no films: choose adaptive or adaptive-fast, or a single"),
-        (["--truth", "moving-toys"], "--truth: not of a film"),
-        (["--zarr"], "--zarr: not of a film"),
+        (["--truth", "moving-toys"], "--truth: no effect on a whole film"),
+        (["--zarr"], "--zarr: no effect on a whole film"),
         (["--frame", "99"], "no frame 99"),
         (["--memory", "100MiB"], "memory of 100 MiB"),
         (["--psi", "absent.h5"], "absent.h5"),

@@ -155,7 +155,7 @@ def test_what_was_estimated_stands_in_a_result_s_metrics_and_on_its_page(tmp_pat
     result = emmc.reconstruct(psi, frames, "tv")
     assert result.metrics()["estimated_from_frames"] == list(frames.estimates)
     page = result.viewer().split("<script")[0]
-    assert "Estimated from the frames, as nobody gave it: black level" in page
+    assert "Not given, so estimated from the frames: black level" in page
     given = emmc.frames(dn, dark=BLACK, white_level=WHITE, gain=GAIN, read_noise=READ)
     told = emmc.reconstruct(psi, given, "tv")
     assert "estimated_from_frames" not in told.metrics()

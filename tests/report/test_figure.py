@@ -128,7 +128,7 @@ def test_a_close_up_shows_the_pixels_around_its_point_of_the_view_asked_for(resu
     [
         (FigureSettings(view=(5, 0)), "view 5,0: there are 5x5 views"),
         (FigureSettings(at=[(36, 0)]), "at 36,0: the pictures have 36x48 pixels"),
-        (FigureSettings(side_px=37), "side 37: the pictures have 36x48 pixels"),
+        (FigureSettings(side_px=37), "side 37: the pictures have only 36x48 pixels"),
     ],
 )
 def test_places_outside_the_picture_are_refused(results, settings, message):

@@ -119,7 +119,7 @@ def test_a_dng_in_a_session_states_time_serial_and_iso():
 
 def test_frames_are_not_written_where_something_else_lies(session, tmp_path):
     (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(AppError, match="holds something else"):
+    with pytest.raises(AppError, match="holds something other"):
         export_dng(session, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(AppError, match="session"):

@@ -99,7 +99,7 @@ def assert_loser_knows(folder, answer, commands):
         if code == 0:
             continue
         if commands[place] in READERS:
-            assert "resume it" in text or "2 pinholes read" in text
+            assert "resume the capture" in text or "2 pinholes read" in text
             continue
         found = re.search(r"held by `(.*)` \(process (\d+) on ", text)
         assert found, text

@@ -111,7 +111,7 @@ def test_a_result_of_another_command_and_foreign_folders_are_refused(out, tmp_pa
     before = contents(tmp_path)
     with pytest.raises(AppError, match="holds the result of simulate"):
         write(out, NEW, command="reconstruct")
-    with pytest.raises(AppError, match="something else"):
+    with pytest.raises(AppError, match="something other"):
         write(tmp_path, NEW)
     with pytest.raises(AppError, match="a file of that name"):
         write(out / "thesis.txt", NEW)

@@ -183,7 +183,10 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(tmp_path, monkeypatch):
 
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
     (tmp_path / "cat.jpg").write_text("meow")
-    for place, why in ((tmp_path, "something else"), (tmp_path / "cat.jpg", "a file of that name")):
+    for place, why in (
+        (tmp_path, "something other"),
+        (tmp_path / "cat.jpg", "a file of that name"),
+    ):
         with pytest.raises(AppError, match=why), study_folder(place, "cells.jsonl", "tables"):
             pytest.fail("taken")
     assert [path.name for path in tmp_path.iterdir()] == ["cat.jpg"]

@@ -140,7 +140,7 @@ def test_the_head_counts_what_breaks_and_compares_methods_on_the_same_faults():
         }
     )
     head = _head(curves(results))
-    assert head.level == "tv holds out best"
+    assert head.level == "tv withstands faults best"
     assert "under 1 of 2 faults" in head.why
     assert any("for comparison, dict-admm: under 2 of 2" in line for line in head.next)
     # tv falls from 29 dB to 10 dB between 1 and 4 px, and never by flicker; dict-admm at 0.3.
@@ -197,7 +197,7 @@ def test_a_method_that_is_not_installed_is_one_line(few_steps, undrawn, monkeypa
     missing = replace(METHODS["dict-admm"], package="no_such_module")
     monkeypatch.setitem(METHODS, "dict-admm", missing)
     outcome = swept(tmp_path / "out", methods=("tv", "dict-admm"))
-    assert outcome.excluded() == ["dict-admm needs no_such_module: not installed"]
+    assert outcome.excluded() == ["dict-admm needs no_such_module, which is not installed"]
     assert {curve.method for curve in outcome.curves} == {"tv"}
     assert {point.method for point in planned(quick(methods=("all",)))} == set(METHODS)
 

@@ -319,7 +319,7 @@ def test_a_dictionary_without_training_suits_every_scene():
 def test_a_scene_too_small_or_of_other_views_is_reported_before_anything_is_measured(tmp_path):
     for name, views, why in (
         ("small", light_field(0, (15, 30)), "15x30 pixels, needs 16x16"),
-        ("few", light_field(0, views=(3, 3)), "cannot give 5x5"),
+        ("few", light_field(0, views=(3, 3)), "fewer than the 5x5"),
     ):
         save_hdf5(tmp_path / name / f"{name}.h5", views, {})
         with pytest.raises(Exception, match=why):

@@ -53,10 +53,12 @@ def read_in_child(
             command, input=json.dumps(job).encode(), capture_output=True, timeout=PATIENCE_S
         )
     except subprocess.TimeoutExpired as fault:
-        raise ValueError(f"not read within {PATIENCE_S} s") from fault
+        raise ValueError(f"not read within {PATIENCE_S} s: save it in another format") from fault
     if done.returncode != 0:
         lines = done.stderr.decode(errors="replace").strip().splitlines()
-        raise ValueError(one_line(lines[-1] if lines else "the decoder ended without a word"))
+        raise ValueError(
+            one_line(lines[-1] if lines else "the decoder crashed: copy it again, or save it anew")
+        )
     stream = io.BytesIO(done.stdout)
     facts = parse_json(stream.readline(), "the child", ValueError)
     return np.lib.format.read_array(stream, allow_pickle=False), facts
@@ -118,8 +120,8 @@ def _reader_of_exr(name: str, apart: Collection[str]) -> Reader:
             known = [key for key in ("RGB", "RGBA", "Y", "YA") if key in channels]
             if len(file.parts) > 1 or len(known) != 1:
                 raise ValueError(
-                    f"{len(file.parts)} part(s) with the channels {', '.join(channels)}, where a "
-                    "picture has one with R, G and B, or Y"
+                    f"its parts, {len(file.parts)}, have the channels {', '.join(channels)}, where "
+                    "a picture has one part with R, G and B, or Y"
                 )
             codes = channels[known[0]].pixels
         opaque = True

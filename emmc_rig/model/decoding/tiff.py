@@ -226,7 +226,7 @@ def _shown(codes: NDArray, page: Any, is_shaped: bool) -> _Shown:
         blank = int(np.count_nonzero(codes == page.nodata))
         if blank:
             raise ValueError(
-                f"{blank} pixel(s) are {page.nodata:g}, which the file says are not valid"
+                f"pixels with the value {page.nodata:g}, which the file calls not valid: {blank}"
             )
     if codes.dtype == bool:
         codes = codes.astype(np.uint8)

@@ -216,7 +216,8 @@ class DesignStudy(Study[Simulation]):
                 "to have it made, send the mask's GDSII file, which is beside that camera",
             ],
         )
-        masks = f"{len(found.tried)} masks tried for {bench.shots} shot(s) by theory"
+        shots = f"{bench.shots} shot{'s' * (bench.shots > 1)}"
+        masks = f"{len(found.tried)} masks tried by theory for {shots}"
         metrics = {
             "winner": asdict(found.winner),
             "expected": asdict(found.expected),

@@ -285,7 +285,7 @@ def _head(curves: Sequence[Curve]) -> Head:
     broken.update(curve.method for curve in first if curve.below_best() is not None)
     (best, least), *others = reversed(broken.most_common())
     return Head(
-        f"{best} holds out best" if others else best,
+        f"{best} withstands faults best" if others else best,
         f"it falls {LOST_DB:g} dB below its best under {least} of {faults} faults"
         + (", the fewest" if others else ""),
         [
