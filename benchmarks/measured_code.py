@@ -59,8 +59,8 @@ def commit_of_code(rooms: Iterable[str] = CALIBRATING) -> str:
 def changed_since(commit: str, rooms: tuple[str, ...] = FITTING) -> tuple[str, ...]:
     """Return the files of the rooms whose code differs from that of a commit.
 
-    Comments, docstrings, texts of errors and layout do not count. For an unknown commit, or
-    one with a +, all rooms are returned.
+    Comments, docstrings, layout, what errors say and texts of several words do not count. For an
+    unknown commit, or a commit with a +, all rooms are returned.
     """
     if not commit or commit.endswith("+") or not _git("cat-file", "-t", commit):
         return rooms
@@ -78,11 +78,15 @@ def _differs(name: str, commit: str) -> bool:
 
 
 def _without_words(source: str) -> str:
-    """Return the syntax tree of a module without strings alone on a line and what errors say."""
+    """Return the syntax tree of a module without strings alone on a line and what users read."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             node.exc = node.exc.func  # an error that is raised ends a measurement, whatever it says
+        if isinstance(node, ast.JoinedStr) and any(map(_is_words, node.values)):
+            node.values = [part for part in node.values if not _is_str(part)]
+        if isinstance(node, ast.Constant) and _is_words(node):
+            node.value = ""
         body = getattr(node, "body", None)
         if isinstance(body, list):
             node.body = [line for line in body if not _is_text(line)]  # type: ignore[attr-defined]
@@ -90,11 +94,15 @@ def _without_words(source: str) -> str:
 
 
 def _is_text(line: ast.AST) -> bool:
-    return (
-        isinstance(line, ast.Expr)
-        and isinstance(line.value, ast.Constant)
-        and isinstance(line.value.value, str)
-    )
+    return isinstance(line, ast.Expr) and _is_str(line.value)
+
+
+def _is_str(node: ast.AST) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def _is_words(node: ast.AST) -> bool:
+    return _is_str(node) and " " in ast.literal_eval(node)
 
 
 def _git(*words: str) -> str:

@@ -7,6 +7,7 @@ import pytest
 import results_page
 
 BEFORE = '"""Words."""\n\nLIMIT = 3\n"""Of what."""\nif not LIMIT:\n    raise ValueError("no")\n'
+BEFORE += 'NAME = "tv"\nprint(f"no limit: {LIMIT}")\n'
 
 
 @pytest.fixture
@@ -31,6 +32,9 @@ def commit(tmp_path, monkeypatch):
         ("one.py", BEFORE.replace("Words", "Other words").replace("Of what", "Of all"), ()),
         ("one.py", BEFORE.replace("\n\nLIMIT", "\n\n# Three.\nLIMIT"), ()),
         ("one.py", BEFORE.replace('"no"', 'f"no {LIMIT}: raise it"'), ()),
+        ("one.py", BEFORE.replace("no limit: {LIMIT}", "{LIMIT} is no limit"), ()),
+        ("one.py", BEFORE.replace("{LIMIT}", "{-LIMIT}"), ("room/one.py",)),
+        ("one.py", BEFORE.replace("tv", "adaptive"), ("room/one.py",)),
         ("one.py", BEFORE.replace("ValueError", "KeyError"), ("room/one.py",)),
         ("one.py", BEFORE.replace("3", "4"), ("room/one.py",)),
         ("camera.yaml", "views: 7\n", ("room/camera.yaml",)),
