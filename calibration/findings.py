@@ -319,7 +319,7 @@ def power_advice(power: Power) -> list[str]:
     if not power.sure:
         return []
     return [
-        f"readings go with the light to the power of {1 + power.size:.3f} +- "
+        f"the readings follow the light to the power of {1 + power.size:.3f} +- "
         f"{power.deviation:.3f}: the sensor's response is not linear, or its files are not; Psi's "
         "deviation includes it; read linear files, or add `response: [0.25, 0.5, 0.75]` under "
         "whiteboards in the plan and capture again"

@@ -93,7 +93,7 @@ class Dictionary:
         v, u, _, _, colours = self.patch_shape
         if (v, u) != tuple(views) or colours != 3:
             raise DictionaryError(
-                f"the dictionary's patches have {v}x{u} views of {colours} colour(s), not "
+                f"the dictionary's patches have {v}x{u} views of {colours} colours, not "
                 f"{views[0]}x{views[1]} of 3: train or choose a dictionary for these views"
             )
 

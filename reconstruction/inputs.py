@@ -39,7 +39,7 @@ def _unlike(given: tuple[int, ...], needed: tuple[int, int, int]) -> str:
     if len(given) != 3:
         return f"{len(given)} axes instead of three"
     if list(given[1:]) == size:
-        return f"{given[0]} shot(s), Psi is of {shots}: use the Psi measured with these shots"
+        return f"shots given: {given[0]}, Psi is of {shots}: use the Psi measured with these shots"
     if list(given[:0:-1]) == size:
         return "rows and columns are swapped: frames.swapaxes(1, 2)"
     for k in range(2, 17):

@@ -321,7 +321,7 @@ def reconstruct_sparse(
     if estimates.empty:
         uncovered = int((estimates.weight == 0).sum())
         advice.append(
-            f"{estimates.empty} patches hold no usable pixel, {uncovered} samples were left at 0: "
+            f"patches without a usable pixel: {estimates.empty}; samples left at 0: {uncovered}; "
             "expose shorter or add a shot"
         )
     return Reconstruction(

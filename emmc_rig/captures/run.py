@@ -264,8 +264,8 @@ def way_on_named(request: CaptureRequest, session: Session) -> Iterator[None]:
             session.forget()
         if not isinstance(fault, GaveUpError):
             raise
-        way = f"{kept} frames are kept" if kept else "nothing was captured"
-        line = f"{fault}; {way}: correct it, then run the same command"
+        way = f"frames kept: {kept}" if kept else "nothing was captured"
+        line = f"{fault}; {way}; correct it, then run the same command"
         edited = kept and is_session(request.plan_path)
         raise AppError(line, "capture-edited" if edited else None, request.out) from fault
 

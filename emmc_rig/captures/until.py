@@ -108,7 +108,7 @@ class Until:
         session, target_db = self._session, self._session.target_db
         assert target_db is not None
         began_s = now_s()
-        self._watcher.tell(f"reconstructing from {len(shots)} shot(s) by {METHOD}")
+        self._watcher.tell(f"shots so far: {len(shots)}; reconstructing by {METHOD}")
         stated_db, advice = self._stated(shots)
         planned = {frame.bench.shot for frame in session.frames if frame.kind == "shot"}
         left = sorted(planned - set(shots))

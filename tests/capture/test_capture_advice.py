@@ -729,7 +729,7 @@ def test_a_capture_goes_on_after_any_fault_of_a_device_that_was_mended(bench):
         bench.light.faults[AGAIN] = fault
         line = bench.refused()
         assert str(fault) in line
-        assert "9 frames are kept: correct it, then run the same command" in line
+        assert "frames kept: 9; correct it, then run the same command" in line
         retries = of_kind(Session(bench.session).journal.entries, RetryEntry)
         assert retries[-1].attempt == (1 if isinstance(fault, HOPELESS) else 2)
     bench.light.faults.clear()

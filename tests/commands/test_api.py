@@ -442,7 +442,7 @@ MISTAKES = {
         sized(lambda r: np.repeat(r[0][..., None], 3, axis=-1)),
         "a picture of three colours",
     ),
-    "one shot of two": (sized(lambda r: r[:1]), r"1 shot\(s\), Psi is of 2: use the Psi"),
+    "one shot of two": (sized(lambda r: r[:1]), r"shots given: 1, Psi is of 2: use the Psi"),
     "rows as columns": (sized(lambda r: r.swapaxes(1, 2)), r"swapped: frames.swapaxes\(1, 2\)"),
     "frames not binned": (
         sized(lambda r: np.kron(r, np.ones((1, 2, 2)))),

@@ -259,7 +259,7 @@ def test_planes_behind_one_page_are_frames_and_smaller_copies_are_not(tmp_path):
         file.write(STACK[0, ::2, ::2], subfiletype=1)
     own = read_own(tmp_path / "b.tif")
     assert np.array_equal(own.frames, STACK[:1])
-    assert own.notes[0].endswith("b.tif: 1 page(s) that are smaller copies are not taken")
+    assert own.notes[0].endswith("b.tif: pages that are smaller copies are not taken: 1")
 
 
 @pytest.mark.slow

@@ -107,7 +107,7 @@ def test_a_patch_without_usable_pixels_says_nothing(random_psi, scene):
     usable[:, 6:12, 6:12] = False
     result = solved(psi, truth, dictionary, usable=usable)
     assert result.status == "incomplete"
-    assert "1 patches hold no usable pixel, 36 samples" in result.advice
+    assert "patches without a usable pixel: 1; samples left at 0: 36" in result.advice
     assert not result.light_field[:, :, 6:12, 6:12].any()
     kept = np.ones(truth.shape[2:4], dtype=bool)
     kept[6:12, 6:12] = False

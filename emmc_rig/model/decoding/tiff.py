@@ -68,7 +68,7 @@ def read_tiff(path: str, apart: Collection[str]) -> tuple[NDArray, dict[str, Any
             pages = [page.aspage() for top in tiff.pages for page in (top, *(top.pages or ()))]
             kept = [page for page in pages if not _is_copy(page)] or pages
             if len(kept) < len(pages):
-                notes = [f"{len(pages) - len(kept)} page(s) that are smaller copies are not taken"]
+                notes = [f"pages that are smaller copies are not taken: {len(pages) - len(kept)}"]
             taken = [_Page(page) for page in kept]
         else:
             series = _Series(tiff, Path(path), described, apart, files)
