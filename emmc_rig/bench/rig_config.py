@@ -292,13 +292,13 @@ def rig(
             all of others.
         seed: random seed of scene and noise.
         rays: rays traced per view and pixel, 16 or more; calibration to a per cent needs 1024.
-            None: the default of `simulators.bench`.
+            None: 128.
         real_time: whether moves and exposures take as long as on a real bench.
         flaws: imperfections of the bench, by the names in `simulators.effects`.
 
     Raises:
         AppError: a file that cannot be read, or with a wrong entry; an argument that the simulated
-            rig does not take.
+            rig does not take. The scene is opened, and its errors raised, by `capture`.
         ArgumentError: a name that is no path.
 
     >>> import emmc_rig as emmc

@@ -3,6 +3,8 @@
 A built-in name wins over a folder of that name; write `./dark` for the folder.
 """
 
+from __future__ import annotations
+
 import os
 import warnings
 from collections.abc import Callable

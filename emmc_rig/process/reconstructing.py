@@ -475,8 +475,8 @@ def open_frames(
         Psi, and frames (shot, pixel_y, pixel_x) of normalised readings.
 
     Raises:
-        AppError: a folder without frames or Psi, a session whose shots are not captured.
-        SensingError: a damaged Psi.
+        AppError: a folder without frames, a session whose shots are not captured.
+        SensingError: no Psi, or a damaged one.
         CalibrationError: whiteboards of the session that measure no Psi.
         ArgumentError: a folder or file that is no path.
 

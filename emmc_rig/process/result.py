@@ -206,6 +206,9 @@ class Result(LightFieldArray):
         Returns:
             `psnr_db` and `ssim` over all measured views and colours, peak 1; `replicate_psnr_db`,
             the PSNR of the true centre view in all places, which a light field has to beat.
+
+        Raises:
+            SceneError: a truth of another shape.
         """
         return compared(self.light_field, np.asarray(truth), self.solved.measured)
 
