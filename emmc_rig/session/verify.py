@@ -60,7 +60,7 @@ class Verdict:
             shown = ", ".join(self.missing[:5]) + (", ..." if len(self.missing) > 5 else "")
             yield f"{len(self.missing)} of {self.planned} frames not captured yet: {shown}"
         if self.spared:
-            yield f"{self.spared} more frame(s) planned, which were not needed"
+            yield f"{self.spared} more frame(s) planned, which were not needed for the PSNR"
         if self.dropped:
             yield f"{self.dropped} frame(s) of the film dropped, each named in the journal"
         if self.unreadable:
