@@ -17,7 +17,7 @@ import joblib
 import matplotlib
 import numpy as np
 import pandas as pd
-from measured_code import COMMIT, FITTING, changed_since, commit_of_code
+from measured_code import COMMIT, changed_since, commit_of_code, rooms_of
 
 import emmc_rig
 from emmc_rig.formats.scenes import Scene
@@ -99,11 +99,12 @@ def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, ar
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{name}.csv"
     kept = pd.read_csv(path, dtype=str) if path.is_file() else pd.DataFrame()
-    keys, commit = list(points[0]), commit_of_code(FITTING)
+    keys, rooms = list(points[0]), rooms_of(name)
+    commit = commit_of_code(rooms)
     wanted = {tuple(map(_text, point.values())) for point in points}
     if not {*keys, COMMIT} <= set(kept.columns):
         kept = pd.DataFrame(columns=[*keys, COMMIT])
-    same = [of == commit or not changed_since(of) for of in kept[COMMIT].fillna("")]
+    same = [of == commit or not changed_since(of, rooms) for of in kept[COMMIT].fillna("")]
     stays = [s or key not in wanted for s, key in zip(same, _keys(kept, keys), strict=True)]
     kept = kept[np.array(stays, dtype=bool)]
     known = set(_keys(kept, keys))

@@ -59,8 +59,8 @@ def commit_of_code(rooms: Iterable[str] = CALIBRATING) -> str:
 def changed_since(commit: str, rooms: tuple[str, ...] = FITTING) -> tuple[str, ...]:
     """Return the files of the rooms whose code differs from that of a commit.
 
-    Comments, docstrings and layout do not count. For an unknown commit, or a commit with a +, all
-    rooms are returned.
+    Comments, docstrings, layout and the texts of errors do not count. For an unknown commit, or a
+    commit with a +, all rooms are returned.
     """
     if not commit or commit.endswith("+") or not _git("cat-file", "-t", commit):
         return rooms
@@ -78,9 +78,13 @@ def _differs(name: str, commit: str) -> bool:
 
 
 def _without_words(source: str) -> str:
-    """Return the syntax tree of a module without docstrings and other strings alone on a line."""
+    """Return the syntax tree of a module without strings alone on a line or in a `raise`."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
+        if isinstance(node, ast.Raise):
+            for part in ast.walk(node):
+                if isinstance(part, ast.Constant) and isinstance(part.value, str):
+                    part.value = ""
         body = getattr(node, "body", None)
         if isinstance(body, list):
             node.body = [line for line in body if not _is_text(line)]  # type: ignore[attr-defined]

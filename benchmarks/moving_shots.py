@@ -6,7 +6,9 @@ At rest the shots are a film, too: its last frame against all shots of one captu
 
 from __future__ import annotations
 
+import importlib
 from functools import lru_cache
+from pathlib import Path
 
 import lab
 import numpy as np
@@ -103,7 +105,9 @@ def main() -> None:
     args = lab.parsed(parser)
     steps = args.step or (STEPS_PX[:1] if args.smallest else STEPS_PX)
     points = lab.points(args, ({"shots": args.shots, "step_px": step} for step in steps))
-    rows = lab.measured(points, measure, "moving-shots", args)
+    # A cached function is pickled by the name of its module, which must not be __main__.
+    module = importlib.import_module(Path(__file__).stem)
+    rows = lab.measured(points, module.measure, "moving-shots", args)
     rows["loss_db"] = rows.moved_db - rows.rest_db
     axes = rows.pivot_table(index="step_px", columns="scene", values="loss_db").plot()
     axes.set(ylabel="dB over the same at rest")

@@ -12,6 +12,8 @@ WIDTH, TEXT_PX = 560, 14
 CHARACTER_PX = 7.6
 """Width of a character, to keep labels apart."""
 ROW_PX, PLOT_PX = 26, 250
+MOST_POWERS = 4
+"""Of ten on a logarithmic axis, with figures between them."""
 STYLE = """
 svg{--paper:#fff;--ink:#1d2730;--soft:#55626d;--grid:#dfe5ea;--c0:#0b63c4;--c1:#c2570c;--c2:#2b8a4b;
 --c3:#8b3fa8;--c4:#7b8894;font:14px system-ui,sans-serif}
@@ -136,7 +138,9 @@ class _Frame:
         bottom = self.top + self.height
         for tick in ticks:
             yield _line(self.x(tick), self.top, self.x(tick), bottom, "var(--grid)")
-            yield _text(self.x(tick), bottom + 18, f"{tick:g}", "middle", "soft")
+            figure = f"{tick:,.10g}"
+            at = min(self.x(tick), WIDTH - 6 - CHARACTER_PX * len(figure) / 2)
+            yield _text(at, bottom + 18, figure, "middle", "soft")
         yield _text((self.left + WIDTH - 24) / 2, bottom + 38, name, "middle", "soft")
 
     def plotted(self, axes: tuple[str, str], parts: Iterator[str]) -> str:
@@ -224,9 +228,13 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _decades(low: float, high: float) -> list[float]:
-    """Return 1, 2 and 5 of every power of ten between the ends of a logarithmic axis."""
+    """Return 1, 2 and 5 of every power of ten between the ends of a logarithmic axis.
+
+    Of many powers, 1 alone: there is no room for more.
+    """
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    every = [round(times * 10.0**power, 10) for power in powers for times in (1, 2, 5)]
+    of_each = (1, 2, 5) if len(powers) <= MOST_POWERS else (1,)
+    every = [round(times * 10.0**power, 10) for power in powers for times in of_each]
     return [value for value in every if low <= value <= high]
 
 

@@ -6,7 +6,16 @@ import measured_code
 import pytest
 import results_page
 
-BEFORE = '"""Words."""\n\nLIMIT = 3\n"""Of what."""\n'
+BEFORE = '''"""Words."""
+
+LIMIT = 3
+"""Of what."""
+
+
+def check(name):
+    if name != "a":
+        raise ValueError(f"{name}: unknown")
+'''
 
 
 @pytest.fixture
@@ -30,6 +39,9 @@ def commit(tmp_path, monkeypatch):
         ("one.py", BEFORE, ()),
         ("one.py", BEFORE.replace("Words", "Other words").replace("Of what", "Of all"), ()),
         ("one.py", BEFORE.replace("\n\nLIMIT", "\n\n# Three.\nLIMIT"), ()),
+        ("one.py", BEFORE.replace(": unknown", " is not known"), ()),
+        ("one.py", BEFORE.replace("ValueError", "KeyError"), ("room/one.py",)),
+        ("one.py", BEFORE.replace('"a"', '"b"'), ("room/one.py",)),
         ("one.py", BEFORE.replace("3", "4"), ("room/one.py",)),
         ("camera.yaml", "views: 7\n", ("room/camera.yaml",)),
     ],

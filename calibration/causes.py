@@ -43,6 +43,10 @@ LEAST_MOVED_UM = 0.25
 rays a pixel leaves three times the noise, which as moves were 0.05 to 0.2 um."""
 MOVED_STEPS, BRIGHTNESSES = np.geomspace(1 / 16, 64.0, 17), np.geomspace(5e-5, 0.1, 12)
 """Widths that are tried: of moves in units of LEAST_MOVED_UM; of brightness relative."""
+LEAST_LIGHT = 0.005
+"""Likewise of brightness, relative: times the deviation of what the model misses, in noise. Without
+it, diffraction and the grain of few rays passed for holes of other areas
+(`benchmarks/calibration_checks.py effects`)."""
 LEAST_GAIN = 1.0
 """Of the log evidence by a cause: less tells nothing."""
 NEARLY = 3.0
@@ -57,6 +61,8 @@ HOLES, HANDS, EXPOSURE, PLATE, TURN = "holes", "hands", "exposure", "plate", "tu
 SIZE = "size"
 OF_HOLES = (HANDS, HOLES, EXPOSURE, PLATE, SIZE, TURN)
 """Causes of whiteboards through the pinhole alone."""
+OF_LIGHT = (LAMP, HOLES, EXPOSURE, SIZE)
+"""Causes of brightness alone."""
 OF_PLATE = (HANDS, PLATE, TURN)
 """Causes by which pinholes stand off their holes."""
 SHIFTING = (STAGE, HANDS, HOLES, PLATE, SIZE, TURN)

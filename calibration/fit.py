@@ -42,10 +42,12 @@ from emmc_rig.calibration.causes import (
     HANDS,
     HOLES,
     LAMP,
+    LEAST_LIGHT,
     LEAST_MOVED_UM,
     LEAST_OWN,
     LENS,
     OF_HOLES,
+    OF_LIGHT,
     OF_PLATE,
     OWN,
     PLATE,
@@ -676,7 +678,11 @@ def _find_causes(
     Aberrations displace the shadows of the views as pinholes do that stand off their holes, and
     are tried where something does.
     """
-    causes = list(bench.causes.values())
+    least = LEAST_LIGHT * float(np.sqrt(point.normal.spread**2 - 1))
+    causes = [
+        replace(cause, least=least) if cause.name in OF_LIGHT else cause
+        for cause in bench.causes.values()
+    ]
     own = _own_information(point, bench)
     found = find_causes(own, causes, bench.own2, bench.always)
     if not any(cause.name in SHIFTING for cause in found) or bench.always:

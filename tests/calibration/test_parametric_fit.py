@@ -170,6 +170,18 @@ def test_flicker_and_a_moved_stage_are_found_on_the_board_that_has_them(design):
     assert fit.moved_um == pytest.approx(3.0, rel=0.2)
 
 
+@pytest.mark.parametrize(("doubled", "named"), [(0.0, True), (0.05, False)])
+def test_what_the_model_misses_is_no_hole_of_another_area(doubled, named, design):
+    level = np.random.default_rng(3).normal(1, 0.01, len(FEW))
+    boards = [
+        replace(board, reading=(share * seen).astype(np.float32))
+        for board, share in zip(synthetic(design, designed_placement(CAMERA)), level, strict=True)
+        for seen in [(1 - doubled) * board.reading + doubled * np.roll(board.reading, 4, axis=1)]
+    ]
+    found = fit_placement(boards, CAMERA, MASK).causes
+    assert bool({cause.name for cause in found} & {LAMP, HOLES}) == named
+
+
 @pytest.mark.parametrize("name", [LAMP, HOLES])
 def test_a_cause_is_named_only_for_whiteboards_where_it_is_far_outside_its_deviation(name, design):
     boards = synthetic(design, replace(designed_placement(CAMERA), blur_um=3.0))
