@@ -93,9 +93,11 @@ def calibrate(
         camera: with arrays, the camera as designed; its sensor's noise states the white level, DN.
         darks: with arrays, frames with the lamp off, (repeat, y, x) in DN, at the exposure of the
             first whiteboard; or a dict of such frames by exposure.
-        method: "parametric" fits position, scale and angle of the designed masks; "mixed" also the
-            transmittance of their cells; "free" takes each view from its own pinhole; "auto" tries
-            all methods for which the whiteboards suffice, and chooses by the validation.
+        method: "parametric" fits the positions of the designed masks; "mixed" also finds dust and
+            defects of the masks; "free" measures every coefficient of Psi, through a pinhole of
+            each view; "auto" tries all methods for which the whiteboards suffice. Of the methods
+            whose residual on the validation whiteboards is noise, it takes that of the least
+            stated error.
         sensor: whether gain, read noise and other figures of a session's sensor are measured, too,
             from its darks and references.
         watcher: with a session, a `Watcher` whose methods are called with stages and steps.
