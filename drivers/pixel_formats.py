@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 Array = np.ndarray
+Kernel = Callable[[Array, Array], None]
 
 CFA = {"Mono": "mono", "BayerRG": "rggb", "BayerGR": "grbg", "BayerGB": "gbrg", "BayerBG": "bggr"}
 
@@ -120,28 +121,33 @@ def _unpack_flat(packed: Array, form: PixelFormat, pixels: Array) -> None:
         pixels[-rest:] = group[:rest]
 
 
-@njit(cache=True, nogil=True)
+def compiled(plain: Callable[..., None]) -> Kernel:
+    """Return a kernel as machine code, kept on the disk where Numba has a folder to write to."""
+    try:
+        return njit(cache=True, nogil=True)(plain)
+    except RuntimeError:  # neither this folder nor the user's home can be written to
+        return njit(nogil=True)(plain)
+
+
+@compiled
 def widen(packed: Any, pixels: Any) -> None:
     """Set pixels from one byte each."""
     for i in range(pixels.size):
         pixels[i] = packed[i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def join_bytes(packed: Any, pixels: Any) -> None:
     """Set pixels from two bytes each, the low one first."""
     for i in range(pixels.size):
         pixels[i] = np.uint16(packed[2 * i]) | (np.uint16(packed[2 * i + 1]) << np.uint16(8))
 
 
-Kernel = Callable[[Array, Array], None]
-
-
 def low_first(bits: int) -> Kernel:
     """Return what sets four pixels from every 5 or 6 bytes, lowest bits first."""
     mask = np.uint16((1 << bits) - 1)
 
-    @njit(cache=True, nogil=True)
+    @compiled
     def unpack_p(packed: Any, pixels: Any) -> None:
         for i in range(pixels.size // 4):
             for k in range(4):
@@ -156,7 +162,7 @@ def high_and_low(bits: int) -> Kernel:
     """Return what sets two pixels from every three bytes: high, the low bits of both, high."""
     below, mask = np.uint16(bits - 8), np.uint16((1 << (bits - 8)) - 1)
 
-    @njit(cache=True, nogil=True)
+    @compiled
     def unpack_packed(packed: Any, pixels: Any) -> None:
         for i in range(pixels.size // 2):
             both = np.uint16(packed[3 * i + 1])

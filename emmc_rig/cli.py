@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -88,6 +89,8 @@ def root(
 
 def main() -> None:
     """Run the program; an error of `ERRORS` becomes a line without a traceback."""
+    # Matplotlib warns in two lines where the home is read-only, and works all the same.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         with _warnings_as_notes():
             code = app(args=_typed(), prog_name="emmc-rig", standalone_mode=False) or 0

@@ -21,7 +21,10 @@ class StoppedError(AppError):
 
 
 class StopCapture(Exception):  # noqa: N818
-    """Raised by a hook of a plan to end the capture, with the reason; frames taken are kept."""
+    """A hook of a plan raises it to end the capture: `raise StopCapture("the lamp is off")`.
+
+    The frames captured so far are kept, and the same command or call resumes the capture.
+    """
 
 
 ERRORS = (AppError, ModelError, DriverError, CalibrationError, ReconstructionError)

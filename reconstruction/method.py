@@ -91,10 +91,11 @@ class Given:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How much faults of a capture harm a method: factors on the verdict's limits, 1 for TV's.
+    """How much a method tolerates faults of a capture: factors on the verdict's limits.
 
-    psi: on those of an error of Psi; methods that assume more than total variation lose 3 dB
-    sooner. bad_pixels: total variation evens out twice as many single wrong readings.
+    psi: on the limits for an error of Psi. It is 1 for total variation; methods that assume more
+    about the light field lose 3 dB sooner.
+    bad_pixels: on the limits for single wrong readings; total variation tolerates twice as many.
     """
 
     psi: float = 0.7
@@ -107,17 +108,26 @@ def _no_patches(psi: Psi, settings: ShippedSettings) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One way to reconstruct, as a module of `reconstruction.methods` offers it.
+    """A method of reconstruction, as a module of `reconstruction.methods` offers it.
 
-    assumes, cost, when: for people, cost in seconds. solve: from what is given and
-    the settings of all methods. part, settings: the name and type of its own part of the settings.
+    name: as `emmc_rig.reconstruct` takes it. title: a line that names the method.
+    assumes, cost, when: for people: the assumption about light fields, the cost in seconds, and the
+    captures for which to use the method.
+    solve: a function of the inputs (`Given`) and the settings of all methods, which returns a
+    `Reconstruction`.
+    part, settings: name and type of its own part of the settings.
+    needs_dictionary: whether the inputs need a dictionary.
     films: whether it takes scenes that move: films, frame after frame, and shots.
-    package: what it needs beyond the core installation; it is then learned, for some views only.
-
-    factor: seconds over those of the method of factor 1; a time budget chooses the largest factor
-    that fits, so the costlier method has to be the more accurate; None: a budget does not choose
-    this method. scout, patches: for light fields in blocks, the method whose disparities set the
-    overlap of blocks, and the sparse patches that this method averages with.
+    sensitivity: factors on the verdict's limits.
+    package: the package it needs beyond the core installation, None: none. Such a method is
+    learned, for some numbers of views only.
+    factor: its seconds over those of the method with factor 1. A time budget chooses the largest
+    factor that fits, so the costlier method has to be the more accurate. None: a budget does not
+    choose this method.
+    scout: for light fields in blocks, the method whose disparities set the overlap of blocks; None:
+    the overlap does not depend on disparities.
+    patches: a function of Psi and settings, which returns the sparse patches that this method
+    averages with, or None.
     """
 
     name: str
@@ -138,7 +148,7 @@ class Method:
 
     @property
     def installed(self) -> bool:
-        """Whether what it needs is installed."""
+        """Whether the package that it needs is installed."""
         return self.package is None or find_spec(self.package) is not None
 
 

@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 
 
 class Status(StrEnum):
-    """How a reconstruction ended; its advice says what to do about all but the first."""
+    """How a reconstruction ended; a result's `advice` says what to do about all but the first.
+
+    CONVERGED: changes became small. STEP_LIMIT: steps ended before. INCOMPLETE: a part failed or is
+    missing. IN_TILES: computed in tiles, some of which did not converge.
+    """
 
     CONVERGED = "converged"
     STEP_LIMIT = "step limit reached"
@@ -36,14 +40,19 @@ class Progress:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """light_field: (v, u, y, x, c) float32 in [0, 1]; `advice` is empty when converged.
+    """What a method returns: the light field, how the solver ended, and its figures.
 
-    objective: (step, value) pairs. parameters: what the solver chose or was given. maps: what else
-    it found, by name: `disparity` (y, x) in pixels per view step, ... screening: what was
-    done to the frames before, in words. film: of a frame of a film, what the next one goes on from.
-    seconds: without compiling_seconds, in which kernels were compiled or loaded. measured: which
-    views (v, u) the readings say something of; None: all. Others follow from their neighbours, and
-    no figure of accuracy counts them.
+    method: the method's name. light_field: (v, u, y, x, c) float32, linear RGB in [0, 1].
+    status: how the solver ended. advice: what to do about it; empty when converged.
+    steps: number of steps. objective: pairs (step, value of the objective).
+    seconds: without compiling_seconds, in which kernels were compiled or loaded.
+    parameters: figures that the solver chose or was given, by name.
+    maps: further estimates by name, such as `disparity` (y, x) in pixels per view step and `sigma`
+    (v, u, y, x).
+    screening: corrections of the frames before, in words.
+    film: for a frame of a film, the state from which the next frame continues.
+    measured: which views (v, u) the readings contain; None: all. Other views follow from their
+    neighbours, and no figure of accuracy counts them.
     """
 
     method: str

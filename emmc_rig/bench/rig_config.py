@@ -257,7 +257,10 @@ def _described(kind: str, config: ImagedRig | RealRig) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class RigChoice:
-    """Which devices a capture is to use; they are opened by `emmc_rig.capture`, not before."""
+    """Which devices a capture is to use; they are opened by `emmc_rig.capture`, not before.
+
+    name: "simulated", or the file's name. description: plain data that a session keeps of the rig.
+    """
 
     name: str
     description: Mapping[str, Any]
@@ -279,12 +282,24 @@ def rig(
     real_time: bool = False,
     flaws: tuple[str, ...] = (),
 ) -> RigChoice:
-    """Return a rig: "simulated", or the YAML file that names real devices.
+    """Return a rig, simulated or of real devices, whose devices `capture` opens.
 
-    The rest is of the simulated one. scene: what stands before its camera. size: rows and columns
-    of the light field. seed: of scene and noise. rays: per view and pixel; calibration to a per
-    cent needs 1024. real_time: moves and exposures take their time. flaws: imperfections, by the
-    names of `simulators.effects`. Raises AppError.
+    Args:
+        name: "simulated", or the YAML file of a rig. The other arguments are of simulated rigs
+            alone: real devices ignore them.
+        scene: the scene before the camera: what `emmc_rig.scene` takes by name.
+        size: (rows, columns) of samples of the light field. None: (192, 256) for built-in scenes,
+            all of others.
+        seed: random seed of scene and noise.
+        rays: rays traced per view and pixel, 16 or more; calibration to a per cent needs 1024.
+            None: 128.
+        real_time: whether moves and exposures take as long as on a real bench.
+        flaws: imperfections of the bench, by the names in `simulators.effects`.
+
+    Raises:
+        AppError: a file that cannot be read, or with a wrong entry; an argument that the simulated
+            rig does not take. The scene is opened, and its errors raised, by `capture`.
+        ArgumentError: a name that is no path.
 
     >>> import emmc_rig as emmc
     >>> emmc.rig("simulated", scene="near-planar", size=(24, 32)).description["kind"]

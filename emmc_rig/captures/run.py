@@ -392,23 +392,30 @@ def capture(
     on_event: OnEvent | None = None,
     ask: Ask = ask_at_prompt,
 ) -> Session:
-    """Run a plan on a rig and return its session; run again, it goes on where it stopped.
+    """Capture the frames of a plan and return their session; a second call resumes the first.
 
     Args:
-        plan: a plan (YAML), or the folder of a session to go on with.
-        rig: of `emmc_rig.rig`, or its argument; a session has its own rig.
-        out: folder of the session (default: PLAN-session beside the plan).
-        until_db: PSNR, dB, at which no further shot is taken (default: all shots are).
-        other_devices: a session may go on with a camera or stage of another serial number.
-        watcher: observes the capture.
-        on_event: is called with each event of `emmc_rig.captures.events`, as `frame.written` or
-            `shot.done`; a function that raises is not called again.
-        ask: does what no axis of the rig does: lamp, board, masks. By default a person is asked.
+        plan: the YAML file of a plan, or the folder of a session to resume.
+        rig: what `emmc_rig.rig` returns, or its first argument. None: that of the session.
+        out: folder of the session. None: PLAN-session beside the plan.
+        until_db: estimated PSNR, dB, at which no further shot is taken. None: all are taken.
+        other_devices: whether a session may be resumed with a camera or stage of another serial
+            number.
+        watcher: a `Watcher`, whose methods are called with stages, steps and notes.
+        on_event: a function of an `Event`, called for the events that `emmc_rig.captures.events`
+            lists, such as `frame.written`; a function that raises is not called again.
+        ask: a function that is called with the words for a task that no axis of the rig can do
+            (lamp, board, masks), and returns when it is done. By default a person is asked.
+
+    Returns:
+        The session, with all its frames on the disk.
 
     Raises:
-        AppError: a plan, rig or folder that cannot be used; StoppedError by Ctrl-C.
-        DriverError: what a device says.
-        ArgumentError: a plan or rig of another type.
+        AppError: a plan, rig or folder that cannot be used. Its subclass StoppedError: stopped by
+            Ctrl-C, or by a hook; the frames captured are kept, and the same call resumes.
+        DriverError: a device that fails, after retries.
+        CameraError: a plan whose camera is unknown or wrong.
+        ArgumentError: a plan, rig or folder of another type.
     """
     takes = "a plan's YAML file, or the folder of a session to go on with"
     plan = path_of(plan, "plan", takes)

@@ -22,12 +22,12 @@ def find_camera(spec: str | Path | Mapping[str, Any] | Camera, shots: int | None
         spec: a shipped camera's name, the path of a YAML file, a dict with the keys of such a
             file, or a camera. In a dict, what a file lists may be arrays: a mask's pattern is
             (row, column) or (row, column, 3), transmittances in [0, 1], or booleans.
-        shots: how many (default: the camera's own).
+        shots: number of shots, see `Camera.with_shots` (default: those of the description).
 
     Raises:
-        CameraError: no such camera (the message names the nearest shipped one), a description that
-            is wrong, more shots than the camera has a rule for.
-        ArgumentError: anything else than a name, path, dict or camera.
+        CameraError: no such camera (the message names the nearest shipped one), a file that cannot
+            be read, a wrong description, more shots than the camera has a rule for.
+        ArgumentError: a spec of another type, or shots that are no whole number.
 
     >>> import emmc_rig as emmc
     >>> emmc.camera("rgbw-bayer-1shot")

@@ -29,9 +29,11 @@ UNITS = {"sigma": "1", "disparity": "pixel per view", "disparity_sigma": "pixel 
 
 
 class Depth(NamedTuple):
-    """Depth (y, x) of the centre view, mm from the lens, and its standard deviation.
+    """Depth of the centre view and its standard deviation.
 
-    sigma_mm follows from that of the disparity; None without one. The geometry counts as exact.
+    mm: (y, x), mm from the lens; infinite where the disparity is beyond that of infinity.
+    sigma_mm: (y, x), mm, from the standard deviation of the disparity; None where that is unknown.
+    Errors of the geometry and of the focus are not included.
     """
 
     mm: Array
@@ -39,9 +41,12 @@ class Depth(NamedTuple):
 
 
 class LightFieldArray:
-    """A light field (v, u, y, x, c) that NumPy takes as an array.
+    """A light field (v, u, y, x, c), linear RGB, that NumPy takes as an array.
 
-    view_axes: names of v and u. maps: `disparity`, `disparity_sigma` and `sigma`, where known.
+    view_axes: what rows v and columns u of views are, each "angle", "band" or "time".
+    maps: arrays by name, where known: `disparity` and its standard deviation `disparity_sigma`,
+    (y, x) of the centre view, in pixels per view step; `sigma`, the standard deviation of the light
+    field, (v, u, y, x).
     """
 
     light_field: Any
@@ -54,7 +59,7 @@ class LightFieldArray:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(v, u, y, x, c)."""
+        """Lengths of the axes (v, u, y, x, c)."""
         return self.light_field.shape
 
     def __getitem__(self, place: Any) -> Any:
@@ -88,8 +93,16 @@ class LightFieldArray:
     ) -> NDArray[np.float32]:
         """Return the picture (y, x, c) of the whole lens, sharp at a disparity or at a depth.
 
-        disparity: pixels per view step. depth_mm: from the lens. focus_mm, camera: see `depth_mm`.
-        Raises ArgumentError for both or none of them, CameraError for a depth without the optics.
+        Args:
+            disparity: of what shall be sharp, pixels per view step.
+            depth_mm: of what shall be sharp, mm from the lens, instead of the disparity.
+            focus_mm: see `depth_mm`.
+            camera: see `depth_mm`.
+
+        Raises:
+            ArgumentError: both or none of disparity and depth_mm; a distance not above 0.
+            CameraError: a depth, where the camera or the distance of what is sharp is unknown.
+            SceneError: views that are bands or times.
         """
         given = depth_mm if disparity is None else disparity
         if (disparity is not None) + (depth_mm is not None) != 1 or not _is_finite(given):
@@ -100,11 +113,23 @@ class LightFieldArray:
         return shear(self.light_field, float(disparity or 0)).mean(axis=(0, 1))
 
     def all_in_focus(self) -> NDArray[np.float32]:
-        """Return the centre view (y, x, c), with the noise of all views' mean."""
+        """Return the centre view (y, x, c) with less noise: the mean of all views at its surfaces.
+
+        Raises SceneError for views that are bands or times.
+        """
         return all_in_focus(self.light_field, self._centre_disparity)
 
     def view(self, v: float, u: float) -> Array:
-        """Return the picture (y, x, c) from a place among the views, (1.5, 2); ArgumentError."""
+        """Return the picture (y, x, c) from a position between views, such as view(1.5, 2).
+
+        Args:
+            v: position among the rows of views, from 0.
+            u: position among the columns of views, from 0.
+
+        Raises:
+            ArgumentError: a position outside the views.
+            SceneError: a position between views that are bands or times.
+        """
         for name, at, count in (("v", v, self.shape[0]), ("u", u, self.shape[1])):
             if not _is_finite(at) or not 0 <= at <= count - 1:
                 raise refusal(at, name, f"a place among the views, 0 to {count - 1}")
@@ -113,7 +138,15 @@ class LightFieldArray:
         return between(self.light_field, self._disparities, v, u)
 
     def epipolar(self, row: int | None = None, column: int | None = None) -> Array:
-        """Return a row (u, x, c) of the middle row of views, or a column (v, y, c) likewise."""
+        """Return an epipolar image: one row, or one column, of all views in a line.
+
+        Args:
+            row: of the middle row of views, y from 0; returns (u, x, c).
+            column: of the middle column of views, x from 0; returns (v, y, c).
+
+        Raises:
+            ArgumentError: both or none of row and column; a row or column outside the picture.
+        """
         chosen = [(axis, at) for axis, at in ((2, row), (3, column)) if at is not None]
         axis, at = chosen[0] if len(chosen) == 1 else (2, None)
         if not isinstance(at, Integral) or not 0 <= at < self.shape[axis]:
@@ -124,11 +157,19 @@ class LightFieldArray:
         return self.light_field[v, :, at] if axis == 2 else self.light_field[:, u, :, at]
 
     def depth_mm(self, focus_mm: float | None = None, camera: Camera | None = None) -> Depth:
-        """Return the depth of the centre view by its disparity, and its standard deviation.
+        """Return the depth of the centre view, (y, x) in mm from the lens, by its disparity.
 
-        focus_mm: from the lens to what is sharp, where disparity is 0; by default `lens.focus_mm`
-        of the camera's file. camera: whose lens and sample pitch count; by default that of Psi.
-        Raises CameraError, which names the numbers that are missing.
+        An unknown disparity is estimated from the light field; the depth then has no deviation.
+
+        Args:
+            focus_mm: distance from the lens to what is sharp, where disparity is 0. None:
+                `lens.focus_mm` of the camera.
+            camera: the camera, for its lens and sample pitch. None: that of Psi.
+
+        Raises:
+            CameraError: the camera or the distance is unknown; the message names what is missing.
+            ArgumentError: a distance that is not above 0.
+            SceneError: views that are bands or times.
         """
         optics = optics_of(camera or self._seen_by(), focus_mm)
         depth = optics.depth_mm(self._centre_disparity)
@@ -138,10 +179,12 @@ class LightFieldArray:
         return Depth(depth, optics.sigma_mm(depth, searched))
 
     def to_xarray(self) -> Any:
-        """Return an xarray.Dataset (v, u, y, x, c): light field, deviation, disparity, depth.
+        """Return an xarray.Dataset with the dimensions v, u, y, x and c.
 
-        A known camera adds v_mm and u_mm, places on the lens, y_um and x_um, on the sensor, and
-        depth if its file has the optics. Units are attributes. Raises AppError without xarray.
+        Variables: `light_field`, and where known `sigma`, `disparity`, `disparity_sigma`, and
+        `depth` and `depth_sigma` in mm. A known camera adds the coordinates v_mm and u_mm, places
+        on the lens, and y_um and x_um, on the sensor; depth needs its `lens.focus_mm`. Each has the
+        attribute `units`. Raises AppError where xarray is not installed.
         """
         xarray = extra_module("xarray", "to_xarray", "xarray")
         dims = "v", "u", "y", "x"
@@ -170,7 +213,8 @@ class LightFieldArray:
     def to_napari(self) -> list[Any]:
         """Return layers of napari: the views as sRGB, and hidden ones of disparity and deviation.
 
-        `viewer.layers.extend(result.to_napari())` adds them. Raises AppError without napari.
+        `viewer.layers.extend(result.to_napari())` adds them to a viewer. Raises AppError where
+        napari is not installed.
         """
         layers = extra_module("napari.layers", "to_napari", "napari")
         shown = codes_of(srgb_of(self.light_field))

@@ -3,6 +3,8 @@
 A built-in name wins over a folder of that name; write `./dark` for the folder.
 """
 
+from __future__ import annotations
+
 import os
 import warnings
 from collections.abc import Callable
@@ -44,9 +46,13 @@ BY_PARALLAX = "@by-parallax"
 class Scene(LightFieldArray):
     """A light field (v, u, y, x, 3) with its origin, and its disparity if known.
 
-    `disparity_px` is (y, x), pixels per view step, of the centre view. Measured scenes have none,
-    nor have the truths of simulated captures.
     NumPy takes a scene as its light field: `psi @ scene`, `scene[2, 2]`.
+
+    name: the built-in name, the name of the folder or file without its ending, or "array".
+    light_field: (v, u, y, x, 3), linear RGB in [0, 1].
+    disparity_px: (y, x), pixels per view step, of the centre view. None for light fields of files
+    and arrays, and for the truths of simulated captures.
+    provenance: where the light field comes from, in words.
     """
 
     name: str
@@ -98,23 +104,24 @@ def open_scene(
     views: tuple[int, int] | None = None,
     seed: int = 0,
 ) -> Scene:
-    """Open a scene.
+    """Return a scene: a built-in one, the light field of a folder or file, or an array.
 
     Args:
-        spec: a folder of `view_ROW_COL.png`, an `.h5` or `.hdf5` file, a `.zarr` group with
-            `light_field`, a built-in name, or what another of `emmc_rig.formats` that can
-            be read holds; or the light field itself, an array (v, u, y, x, 3) in [0, 1]. A folder
-            or file whose views lie in another order than named is opened as named, with a
-            ViewOrderWarning; `NAME@by-parallax` puts them right.
-        size: rows and columns of pixels: what a built-in scene is rendered at (192x256 by
-            default), the middle that is cut from a measured one (all of it by default).
-        views: rows and columns of views, likewise (5x5 by default).
-        seed: of a built-in scene; measured ones have none.
+        spec: a built-in name, such as "deep-occlusions"; a folder of `view_ROW_COL.png` (or `.tif`,
+            `.exr`); a file or folder with `light_field` (`.h5`, `.hdf5`, `.zarr`), or of another
+            readable format (`.mat`, `NAME_VxU_eslf.png`, OME-Zarr); or an array (v, u, y, x, 3)
+            of linear RGB in [0, 1]. Views whose parallax contradicts their names stay as named,
+            with a ViewOrderWarning; `NAME@by-parallax` reorders them.
+        size: (rows, columns) of pixels. A built-in scene is rendered at this size, by default
+            (192, 256); of other scenes the middle is cut out, by default all is kept.
+        views: (rows, columns) of views, likewise, by default (5, 5) or all.
+        seed: random seed of a built-in scene; other scenes ignore it.
 
     Raises:
-        SceneError: nothing by that name (the message lists the built-in ones), unreadable,
-            or smaller than asked for.
-        ArgumentError: a spec of another type, or a size or seed that is no number.
+        SceneError: no scene of that name (the message lists the built-in ones), a folder or file
+            that cannot be read, fewer pixels or views than requested, an array of another shape or
+            with values outside [0, 1].
+        ArgumentError: an argument of another type.
 
     >>> import emmc_rig as emmc
     >>> emmc.scene("near-planar", size=(24, 32))

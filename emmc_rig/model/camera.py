@@ -126,7 +126,11 @@ class Mask(Settings):
 
 
 class Shot(Settings):
-    """One exposure: which masks, moved by how much (x, y), behind which colour filter."""
+    """One exposure: which masks, moved by how much (x, y), behind which colour filter.
+
+    masks: names of those in the beam; None: all. offset_um: by mask, um from where it is centred.
+    exposure_s: seconds; None: the camera's `total_exposure_s`, divided evenly by the shots.
+    """
 
     masks: tuple[str, ...] | None = None
     offset_um: dict[str, tuple[Offset, Offset]] = Field(default_factory=dict)
@@ -137,9 +141,22 @@ class Shot(Settings):
 class Camera(Settings):
     """A camera with coded masks: `camera.psi(size)` models it, `camera.expose(scene)` uses it.
 
-    view_axes: what rows and columns of views are; bands lie as a mask's shadow shifts with them.
+    Fields are the keys of a camera's YAML file; `emmc_rig.camera` makes a camera of them. Lengths
+    are in mm or um, times in s, as the ending of their name says.
+
+    title: a line that names the camera. reference: where its design is published.
+    views: (rows, columns) of views, the cells of the aperture.
+    view_axes: what rows and columns of views are; bands are placed like views, for masks whose
+    shadow moves with the band.
+    lens: distance from the sensor, pitch of the views, what of them is open, focus.
+    sensor: colour filters, sampling step, binning and noise.
+    masks: by name: distance from the sensor, cell size and pattern of transmittances in [0, 1].
+    shots: for each exposure its masks, their offsets (x, y), and its colour filter.
+    more_shots_step_um: by mask, how far (x, y) each further round of shots moves it, see
+    `with_shots`; None: there are no further shots.
     total_exposure_s: divided evenly by the number of shots; a shot may name its own instead.
-    footprint_splits: see `_transmittances`; more for two masks of cells as fine as their shadow.
+    footprint_splits: parts of samples and openings along each axis, over which products of several
+    masks are averaged; more for masks with cells as fine as their shadow.
     """
 
     title: str
@@ -237,7 +254,10 @@ class Camera(Settings):
         """Return the camera with `count` shots: the first ones, or further rounds of them.
 
         A further round moves the masks by `more_shots_step_um`, and shows the next frames of
-        patterns that have several. Raises CameraError when the camera has no rule for more.
+        patterns that have several.
+
+        Raises:
+            CameraError: no shots, or more than the camera has, without `more_shots_step_um`.
         """
         if count < 1:
             raise CameraError(f"{count} shots: at least one is needed")
@@ -261,9 +281,18 @@ class Camera(Settings):
         return self.model_copy(update={"shots": tuple(moved(index) for index in range(count))})
 
     def psi(self, size: tuple[int, int]) -> Psi:
-        """Return the imaging matrix for light fields of `size` (rows, columns) samples.
+        """Return the imaging matrix, which maps a light field (v, u, y, x, c) to frames.
 
-        Raises CameraError, see `build_imaging_matrix`, and ArgumentError for what is no size.
+        It is normalised: the camera without masks reads 1 from a constant white light field.
+
+        Args:
+            size: (rows, columns) of samples of the light field; `sensor.binning` times those of
+                the sensor's pixels.
+
+        Raises:
+            CameraError: a mask smaller than the beam, pixels that do not divide the light field, a
+                shot that no light reaches.
+            ArgumentError: a size of another type.
         """
         size = pair_of(size, "size", "rows and columns of samples, such as (192, 256)")
         return build_imaging_matrix(self, size)
@@ -275,12 +304,25 @@ class Camera(Settings):
         psi: Psi | None = None,
         exposure_s: ArrayLike | None = None,
     ) -> SimulatedFrames:
-        """Return the frames of a light field (v, u, y, x, c), with the sensor's noise (eq. 14).
+        """Return the frames of a light field, with the sensor's noise (the paper's eq. 14).
 
-        psi: the camera's, where it is at hand; built otherwise. What the same Psi reconstructs
-        looks better than a measurement would: a rig, simulated or real, has its own geometry.
-        exposure_s: seconds of every shot, or of each; None: as the camera says.
-        Raises ArgumentError for another type of scene, seed, Psi or exposure.
+        A reconstruction by the Psi that made the frames is better than one of a measurement: a rig,
+        simulated or real, has its own geometry.
+
+        Args:
+            scene: a scene, or a light field (v, u, y, x, 3), floating, linear RGB in [0, 1].
+            seed: of the noise, or a generator of NumPy.
+            psi: the camera's Psi for this size, if it was computed before. None: it is computed.
+            exposure_s: seconds, a number for all shots, or for each shot. None: the camera's.
+
+        Returns:
+            Frames with `readings`, `deviation` and `usable`, and also `frames_dn`, the raw values
+            in DN, and `noise_free`, the readings without noise; all (shot, pixel_y, pixel_x).
+
+        Raises:
+            ArgumentError: an argument of another type.
+            CameraError: see `psi`.
+            SensingError: a light field of another size than Psi's.
         """
         takes = "a scene, or a light field, a floating array (v, u, y, x, 3) in [0, 1]"
         light_field = numbers_of(scene, "scene", takes)
@@ -347,7 +389,9 @@ class Camera(Settings):
         )
 
     def warnings(self) -> list[str]:
-        """Return what the model neglects although it matters for this camera."""
+        """Return warnings, a sentence each: effects that the model neglects although they matter,
+        and views that the lens's pupil cuts or covers.
+        """
         neglected = []
         for name, mask in self.masks.items():
             number = fresnel_number(mask.cell_um, mask.distance_mm)

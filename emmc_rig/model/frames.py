@@ -32,10 +32,17 @@ class Exposure:
 class Frames:
     """Normalised readings with their noise; all arrays (shot, pixel_y, pixel_x).
 
+    NumPy takes frames as their readings.
+
     readings: 1 is the reading of the fully open camera and a white light field. Saturated pixels
-    have the reading of their white level, a lower bound; other unusable pixels have 0. deviation:
-    standard deviation of each reading. usable: pixels that are neither saturated nor bad.
-    exposures: of each shot; (): unknown. NumPy takes frames as their readings.
+    have the reading of their white level, a lower bound; other unusable pixels have 0.
+    deviation: standard deviation of each reading, in readings.
+    usable: boolean; pixels that are neither saturated nor bad.
+    exposures: exposures and gain of each shot; (): unknown.
+
+    Raises:
+        SensingError: arrays of different shapes, of other than three axes, `usable` not boolean.
+        ArgumentError: no array.
     """
 
     readings: NDArray[np.floating]
@@ -56,7 +63,7 @@ class Frames:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(shot, pixel_y, pixel_x)."""
+        """Lengths of the axes (shot, pixel_y, pixel_x)."""
         return self.readings.shape
 
     @cached_property
@@ -68,7 +75,10 @@ class Frames:
 
     @property
     def noise_sigma(self) -> float:
-        """Root mean variance of the usable readings, which solvers take as their typical noise."""
+        """Root mean square of the usable readings' deviation; 0 where none is usable.
+
+        Solvers take it as the noise of a typical reading.
+        """
         if self.deviation.size and not any(self.deviation.strides):  # one number for all
             return float(self.deviation.flat[0])
         of_usable = self.deviation[self.usable]
@@ -107,7 +117,10 @@ class Frames:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SimulatedFrames(Frames):
-    """Frames of a simulated exposure, with the raw values and what they read without noise."""
+    """Frames of a simulated exposure; see `Frames` for the other fields.
+
+    frames_dn: raw values, DN. noise_free: readings without noise. Both (shot, pixel_y, pixel_x).
+    """
 
     frames_dn: NDArray[np.uint16]
     noise_free: NDArray[np.floating]

@@ -149,18 +149,24 @@ class PsiLayout:
 
 @dataclass(frozen=True, eq=False)
 class Psi(PsiLayout):
-    """Psi in memory, an operator.
+    """The imaging matrix as an operator: `psi @ light_field` are frames.
+
+    `psi.T` is the adjoint. Light fields are (v, u, y, x, c), frames (shot, pixel_y, pixel_x);
+    `scipy.sparse.linalg.aslinearoperator(psi)` takes both flattened. Psi is made by `Camera.psi`,
+    `from_weights`, `from_scipy` or `load`, seldom by its fields:
 
     weights: (shot, v, u, y, stored colour, x), float32 or float64. One stored colour where every
-    pixel sees one colour only, else three. Of a Psi larger than memory an HDF5 dataset: then
-    it is saved and looked at, view by view, and no operator.
-    colour: (shot, y, x) uint8, the colour stored there; None when three are stored.
+    pixel sees one colour only, else three. A Psi larger than memory has an HDF5 dataset instead of
+    an array: it can be saved and read view by view, and is no operator.
+    colour: (shot, y, x) uint8, the colour stored there, 0 red, 1 green, 2 blue; None when three are
+    stored.
     binning: k; a pixel sums k x k samples.
     camera_json: the description of the camera, or "" when unknown.
     view_axes: what rows and columns of views are, each "angle", "band" or "time".
 
-    Psi is an operator: `psi @ light_field` are frames, `psi.T @ frames` is a light field, in their
-    natural shapes; `scipy.sparse.linalg.aslinearoperator(psi)` takes them flattened.
+    Raises:
+        SensingError: weights or colours that fit no light field.
+        ArgumentError: weights that are no floating array.
 
     >>> weights = np.full((1, 1, 1, 4, 3, 6), 1 / 3, dtype=np.float32)
     >>> psi = Psi(weights, colour=None)
@@ -260,14 +266,20 @@ class Psi(PsiLayout):
         return replace(self, weights=self.weights[chosen], colour=colour, camera_json=camera_json)
 
     def forward(self, light_field: Array) -> Array:
-        """Return the frames (shot, pixel_y, pixel_x) of a light field (v, u, y, x, c)."""
+        """Return the frames (shot, pixel_y, pixel_x) of a light field (v, u, y, x, c), no noise.
+
+        Raises SensingError for a light field of another shape.
+        """
         light_field = self._checked(light_field, self.light_field_shape, "a light field")
         frames = np.empty(self.frames_shape, dtype=self.weights.dtype)
         kernels.project(self.weights, self.colour_map, light_field, self.binning, frames)
         return frames
 
     def adjoint(self, frames: Array) -> Array:
-        """Return Psi^T frames, a light field (v, u, y, x, c)."""
+        """Return Psi^T frames, a light field (v, u, y, x, c), of frames (shot, pixel_y, pixel_x).
+
+        Raises SensingError for frames of another shape.
+        """
         frames = np.ascontiguousarray(self._checked(frames, self.frames_shape, "frames"))
         light_field = np.empty(self.light_field_shape, dtype=self.weights.dtype)
         kernels.back_project(self.weights, self.colour_map, frames, self.binning, light_field)
@@ -355,20 +367,27 @@ class Psi(PsiLayout):
         return np.sqrt(np.einsum("ssyx->syx", self.gram))
 
     def light_efficiency(self) -> float:
-        """Return the reading from a white light field, averaged over shots and pixels."""
+        """Return the mean reading of a white light field over shots and pixels; 1: no mask."""
         return float(self.weights.sum(dtype=np.float64) / np.prod(self.frames_shape))
 
     def to_torch(self, device: Any = None) -> TorchPsi:
-        """Return Psi in PyTorch, whose results have gradients; raises SensingError without it.
+        """Return Psi as an operator of PyTorch, whose results have gradients.
 
-        device: where, as PyTorch names it; None: the CPU.
+        Args:
+            device: the device that computes, as PyTorch names it. None: the CPU.
+
+        Raises:
+            SensingError: PyTorch is not installed.
         """
         from emmc_rig.torch import TorchPsi
 
         return TorchPsi.of(self, device)
 
     def to_scipy(self) -> sparse.csr_array:
-        """Return Psi as an explicit sparse matrix without its zeros."""
+        """Return Psi as an explicit sparse matrix, without its zeros.
+
+        Rows are readings (shot, pixel_y, pixel_x), columns samples (v, u, y, x, c), both row-major.
+        """
         from scipy import sparse
 
         _, _, views_u, rows, _, columns = self.weights.shape
@@ -408,8 +427,8 @@ class Psi(PsiLayout):
             view_axes: what rows and columns of views are, each "angle", "band" or "time".
 
         Raises:
-            SensingError: a wrong shape, infinite entries or NaN, or a reading that depends on
-                samples of another pixel.
+            SensingError: a wrong shape; entries that are infinite, NaN, all 0, or below 0 by more
+                than noise; a reading that depends on samples of another pixel.
             ArgumentError: an argument of another type.
 
         >>> from scipy import sparse
@@ -476,7 +495,7 @@ class Psi(PsiLayout):
                 either, as for a monochrome sensor. It is stored as red, since one unknown colour is
                 faster and surer than three; `reconstruct` returns three equal colours.
             binning: k; a pixel sums k x k samples, y and x count the samples.
-            view_axes: what v and u are: `angle`, `band` or `time`.
+            view_axes: what v and u are, each "angle", "band" or "time".
 
         Raises:
             SensingError: weights that are not finite, below 0 by more than noise, or all 0; pixels
@@ -550,7 +569,10 @@ class Psi(PsiLayout):
         return checksum_of(self.binning, self.camera_json, planes, colour, self.view_axes)
 
     def save(self, path: str | Path) -> None:
-        """Write Psi as HDF5 under a temporary name, then rename: never a half file."""
+        """Write Psi as an HDF5 file, whole or not at all; an earlier file is replaced.
+
+        Raises SensingError where the file cannot be written, ArgumentError for what is no path.
+        """
         path = path_of(path, "path", "the name of the file to write")
         try:
             with whole_file(path) as partial, h5py.File(partial, "w") as file:
@@ -568,7 +590,11 @@ class Psi(PsiLayout):
 
     @classmethod
     def load(cls, path: str | Path) -> Psi:
-        """Read a saved Psi; raises SensingError when it is not one, or damaged."""
+        """Return the Psi of a file that `save` wrote.
+
+        Raises SensingError for a file that is missing, damaged or no Psi, and ArgumentError for
+        what is no path.
+        """
         path = path_of(path, "path", "the file of a Psi")
         with stored_arrays(path, SensingError, "measure Psi again") as stored:
             if stored.attributes.get("format") != FORMAT:

@@ -41,12 +41,17 @@ View = Annotated[int, Field(ge=0)]
 
 
 class Pose(Settings):
-    """How the bench stood before a whiteboard.
+    """The bench during a whiteboard: mask position, pinhole, lamp and exposure.
 
-    reference: the aperture open, and no mask in the beam. mask_um: where the mask stood, (x, y)
-    from where the camera's design centres it, None: as in its shot. view: the one (v, u) that a
-    pinhole opened, None: all. validation: used by no fit, to judge by. exposure_s: in any unit, the
-    same for all. taken_s: when, which shows drift.
+    reference: whether the aperture was open and no mask in the beam.
+    mask_um: position of the mask, (x, y) um from where the camera's design centres it; None: that
+    of the shot.
+    shot: the camera's shot, from 0, whose masks and filter were in the beam.
+    view: the view (v, u), from 0, that a pinhole opened; None: all were open.
+    lamp: its colour.
+    validation: whether the whiteboard is used by no fit, to test the calibration.
+    exposure_s: in any unit, the same for all.
+    taken_s: seconds on any clock, for the drift of the lamp.
     """
 
     renamed: ClassVar = {"held_out": "validation"}
@@ -71,34 +76,36 @@ def calibrate(
     sensor: bool = False,
     watcher: Watcher | None = None,
 ) -> SessionCalibration:
-    """Return Psi as whiteboards measure it: those of a session, or arrays with their poses.
+    """Return Psi measured from whiteboards: those of a session, or arrays with their poses.
 
     `calibrate(session)` reads a session of `capture`. `calibrate(whiteboards, poses, camera,
-    darks=darks)` takes arrays of another bench. The result's `psi` is the imaging matrix, its
-    `frames(dn)` makes readings of the bench's raw frames, and its `save(folder)` writes psi.h5 with
-    a report.
-
-    Arrays are calibrated by the methods of a session, and judged by those for validation. A session
+    darks=darks)` takes arrays of another bench, and calibrates them by the same methods. A session
     can also hold whiteboards turned in their plane, with the lamp moved, through pinholes of
     several views at once, or taken after the scene; the report names what arrays lack of that.
-    Lamps of three colours are poses with their `lamp`.
 
     Args:
-        whiteboards: a session, or its folder. Or a list of arrays (repeat, y, x) in DN: at least a
-            reference, of two repeats, one for validation, and as many as the method needs: through
-            the open aperture with the mask in a few places, or through a pinhole of every view.
-        poses: of arrays, a dict for each whiteboard with the keys of `Pose`: lengths in um, times
-            in s, exposures in any unit, the same for all.
-        camera: of arrays, as designed; its noise has the white level in DN.
-        darks: of arrays, (repeat, y, x) in DN, the lamp off, at one exposure, or by exposures.
-        method: parametric, mixed or free; `auto` tries all methods that the whiteboards suffice
-            for, and chooses.
-        sensor: the figures of a session's sensor too, from its darks and references.
-        watcher: is shown the progress of a session's.
+        whiteboards: a session, or its folder. Or a list of arrays (repeat, y, x) in DN: at least
+            one reference of two repeats, one for validation, and as many as the method needs:
+            through the open aperture with the mask in a few places, or through a pinhole of every
+            view.
+        poses: with arrays, a dict for each whiteboard, with the keys of `Pose`: lengths in um,
+            times in s, exposures in any unit, the same for all.
+        camera: with arrays, the camera as designed; its sensor's noise states the white level, DN.
+        darks: with arrays, frames with the lamp off, (repeat, y, x) in DN, at the exposure of the
+            first whiteboard; or a dict of such frames by exposure.
+        method: "parametric" fits the positions of the designed masks; "mixed" also finds dust and
+            defects of the masks; "free" measures every coefficient of Psi, through a pinhole of
+            each view; "auto" tries all methods for which the whiteboards suffice. Of the methods
+            whose residual on the validation whiteboards is noise, it takes that of the least
+            stated error.
+        sensor: whether gain, read noise and other figures of a session's sensor are measured, too,
+            from its darks and references.
+        watcher: with a session, a `Watcher` whose methods are called with stages and steps.
 
     Returns:
-        The calibration. `psi` maps (v, u, y, x, c) to (shot, pixel_y, pixel_x); `held_out_error` is
-        the relative error of the validation whiteboards, without unit.
+        The calibration: `psi` is the imaging matrix; `held_out_error` is the relative error of the
+        predicted validation whiteboard, without unit; `frames(dn)` makes readings of the bench's
+        raw frames; `save(folder)` writes psi.h5 and a report.
 
     Raises:
         AppError: an unknown method; whiteboards without poses, of another size, or fewer than are

@@ -167,20 +167,26 @@ def reconstruct_film(
 ) -> Iterator[Result]:
     """Yield the light field of each frame of a film, computed when the caller asks for it.
 
-    Each goes on from what the frames before it showed. After a cut or a pause call it again.
+    Each estimate also uses the frames before it. After a cut or a pause call the function again.
 
     Args:
-        psi: the imaging matrix. Of several shots, frame t is taken as shot t modulo their number.
+        psi: the imaging matrix. With several shots, frame t is shot t modulo their number.
         frames: an array (t, pixel_y, pixel_x) of readings in the order of time, or an iterable of
             `Frames` of one shot each, (1, pixel_y, pixel_x).
         method: "adaptive" or "adaptive-fast".
         noise_sigma: standard deviation of the readings, as for `reconstruct`.
-        settings: of the methods, or a dict with the keys of a settings file; with {"film":
-            {"segment": 50}} every 50th frame begins as the first does.
-        on_step: is called with the progress after each step of a frame.
+        settings: settings of the methods, or a dict with the keys of a settings file; with {"film":
+            {"segment": 50}} every 50th frame starts anew, like the first. None: the defaults.
+        on_step: is called with the `Progress` after each step of a frame.
+
+    Yields:
+        A `Result` for each frame, in their order.
 
     Raises:
-        AppError: a method that takes no films, and what `reconstruct` raises.
+        AppError: a method that takes no films, wrong settings; of a frame, when its turn comes,
+            what `reconstruct` raises.
+        ReconstructionError: an unknown method; a frame that does not fit Psi, when its turn comes.
+        ArgumentError: an argument of another type.
 
     >>> import emmc_rig as emmc
     >>> scene = emmc.scene("near-planar", size=(24, 32))

@@ -63,7 +63,11 @@ CLIPPED = 4
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeasuredFrames(Frames):
-    """Frames of raw values, with what of their black level, range and noise was estimated."""
+    """Frames made of raw values by `emmc_rig.frames`; see `Frames` for the other fields.
+
+    estimates: black level, white level, noise and gamma, each in words, where they were estimated
+    or assumed instead of given.
+    """
 
     estimates: tuple[str, ...]
 
@@ -83,7 +87,7 @@ def frames(
     gamma: float | None = None,
     exposure_s: ArrayLike | None = None,
 ) -> MeasuredFrames:
-    """Return the readings of raw frames, with the deviation of each and which are usable.
+    """Return the readings of raw frames, the standard deviation of each, and which are usable.
 
     With the black level b, the white board w, the slope g and floor f of the noise's variance, and
     an exposure n times the shortest,
@@ -96,19 +100,22 @@ def frames(
     the structure of mask and scene adds to it.
 
     Args:
-        dn: (shot, y, x), or (y, x) of one shot, raw values of the sensor. What a masked array
-            masks is not usable.
-        dark: the lamp off or the lens covered, at the same exposure: (y, x), (repeat, y, x), or the
-            black level, a number. DN.
-        white_level: the value at which the sensor saturates. DN.
-        gain: DN per electron.
-        read_noise: standard deviation in the dark, in electrons.
+        dn: raw values of the sensor, DN, (shot, y, x), or (y, x) of one shot. Masked values of a
+            masked array are not usable.
+        dark: frames with the lamp off or the lens covered, at the same exposure, (y, x) or
+            (repeat, y, x), or the black level, a number. DN. None: estimated.
+        white_level: the value at which the sensor saturates, DN. None: estimated.
+        gain: DN per electron. None: estimated.
+        read_noise: standard deviation in the dark, electrons. None: estimated.
         white: a white board through the open aperture without masks, (y, x) or (repeat, y, x), or
             one number; it reads 1. Default: the white level does. DN.
         gamma: exponent of codes light ** (1 / gamma), about 2.2 for pictures. None: 1, and
             `estimates` warns if the values look like such codes.
         exposure_s: exposure of every shot in seconds, if they differ; readings are scaled to the
             shortest exposure, at which `white` must be taken. Default: all alike.
+
+    Returns:
+        Arrays (shot, y, x): `readings`, `deviation` and `usable`; and `estimates`, in words.
 
     Raises:
         AppError: axes in another order; values that are not finite, of another size, below 0

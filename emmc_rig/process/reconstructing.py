@@ -78,24 +78,33 @@ def reconstruct(
     settings: MethodSettings | Mapping[str, Any] | None = None,
     on_step: OnStep | None = None,
 ) -> Result:
-    """Return the light field that frames and Psi speak for, with how far to trust it.
+    """Return the light field estimated from frames and Psi, with a verdict on it.
 
     Args:
         psi: the imaging matrix of the camera that took the frames.
-        frames: of `Camera.expose`, `open_frames` or `frames`, or an array (shot, pixel_y,
-            pixel_x) of readings, such as `psi @ scene`.
+        frames: the frames of `Camera.expose`, `open_frames` or `frames`, or an array (shot,
+            pixel_y, pixel_x) of readings, such as `psi @ scene`. White reads 1 without masks.
         method: a name that `emmc-rig reconstruct --list` lists.
-        noise_sigma: standard deviation of the readings, all alike. By default that of the frames;
-            of an array, what the sensor of Psi's camera has at these readings.
-        usable: which readings to use (default: those of the frames, all of an array).
-        dictionary: for methods that need one: itself, its file, or the name of a built-in one.
-        settings: of the methods, or a dict with the keys of a settings file.
-        on_step: is called with the progress after each step.
+        noise_sigma: one standard deviation for all readings, in readings. None: that of the frames;
+            for an array, that of the sensor of Psi's camera at these readings.
+        usable: which readings to use, boolean, (shot, pixel_y, pixel_x). None: those usable in the
+            frames, or all of an array.
+        dictionary: for methods that need one: a dictionary, the path of its file, or "lambertian",
+            which None stands for, too.
+        settings: settings of the methods, or a dict with the keys of a settings file, such as
+            {"tv": {"max_steps": 50}}. None: the defaults.
+        on_step: a function that is called after each step with its `Progress`: step,
+            relative_change, objective and total.
+
+    Returns:
+        A `Result`: `light_field`, `sigma` and `disparity` are arrays, `verdict` says whether to
+        trust them. A solver that did not converge returns a result, too: see its `status`.
 
     Raises:
         AppError: an array without `noise_sigma`, where Psi does not know its camera; an array of
-            raw values of a sensor, or of the codes of a picture.
-        ReconstructionError: a method that is not known, frames that do not fit Psi.
+            raw values of a sensor, or of the codes of a picture; wrong settings.
+        ReconstructionError: an unknown method, frames that do not fit Psi, a file that is no
+            dictionary.
         ArgumentError: an argument of another type.
 
     >>> import emmc_rig as emmc
@@ -454,12 +463,29 @@ def _outcome(place: Place, **given: Any) -> dict | Exception:
 def open_frames(
     folder: str | Path, psi: str | Path | None = None, frame: int | None = None
 ) -> tuple[Psi, Frames]:
-    """Return Psi and the frames of a folder: a session, a result, or what `simulate` wrote.
+    """Return Psi and the frames of a folder: a session, a result, or an output of `simulate`.
 
-    psi: the file of another imaging matrix (default: psi.h5 beside the frames; of a session, its
-    calibration, measured and stored first if need be). frame: of a
-    session's film, by its place in time from 0. Raises AppError, SensingError, CalibrationError, or
-    ArgumentError for what is no path.
+    Args:
+        folder: the folder.
+        psi: the file of another imaging matrix. None: psi.h5 beside the frames, or the calibration
+            of a session. A session with whiteboards and no calibration is calibrated first.
+        frame: of a session with a film, the frame to return, counted from 0.
+
+    Returns:
+        Psi, and frames (shot, pixel_y, pixel_x) of normalised readings.
+
+    Raises:
+        AppError: a folder without frames, a session whose shots are not captured.
+        SensingError: no Psi, or a damaged one.
+        CalibrationError: whiteboards of the session that measure no Psi.
+        ArgumentError: a folder or file that is no path.
+
+    >>> import emmc_rig as emmc
+    >>> psi = emmc.camera("rgbw-bayer-1shot").psi((24, 32))
+    >>> emmc.reconstruct(psi, psi @ emmc.scene("near-planar", size=(24, 32)), "tv").save("kept")
+    >>> psi, frames = emmc.open_frames("kept")
+    >>> frames.shape
+    (1, 24, 32)
     """
     takes = "the folder of a session, or of frames with their Psi"
     folder = path_of(folder, "folder", takes)

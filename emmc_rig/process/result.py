@@ -105,10 +105,15 @@ def figures(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(LightFieldArray):
-    """What `emmc_rig.reconstruct` returns.
+    """A reconstruction: the light field, its uncertainty, and a verdict on whether to trust it.
 
-    solved: what the method returned. verdict: whether to trust it, with reasons and remedies.
-    psi, frames: what it was given. dictionary: the kind of dictionary used; None without one.
+    NumPy takes a result as its light field: `np.asarray(result)`, `result[2, 2]`.
+
+    solved: what the method returned.
+    verdict: `level` ("trust", "cannot tell", "doubt" or "do not use"), `reasons`, each with its
+    remedy, and `words`, all in a line.
+    psi, frames: the inputs of the reconstruction.
+    dictionary: the kind of dictionary used; None without one.
     settings: of the methods; None where all are defaults.
     """
 
@@ -126,35 +131,45 @@ class Result(LightFieldArray):
 
     @property
     def maps(self) -> Mapping[str, NDArray]:
-        """What the method estimated beside the light field, by name; none for most methods."""
+        """Arrays that the method estimated beside the light field, by name; most methods have none.
+
+        `disparity` and `disparity_sigma` (y, x), pixels per view step; `sigma` (v, u, y, x).
+        """
         return self.solved.maps
 
     @property
     def sigma(self) -> NDArray[np.floating] | None:
-        """Standard deviation of the light field, (v, u, y, x); None where the method has none."""
+        """Standard deviation of the light field, (v, u, y, x), of each colour alike.
+
+        None where the method estimates none.
+        """
         return self.maps.get("sigma")
 
     @property
     def stated_db(self) -> float | None:
-        """The PSNR that the method states, dB; None where it has no `sigma`."""
+        """Estimated PSNR, dB, peak 1; None where the method has no `sigma`."""
         return self.solved.stated["stated_db"]
 
     @property
     def stated_interval_db(self) -> list[float] | None:
-        """Lowest and highest PSNR, dB: the true one lies between them in 9 of 10 captures."""
+        """Lowest and highest PSNR, dB: the true one lies between them in 9 of 10 captures.
+
+        None where the method estimates none.
+        """
         return self.solved.stated["stated_interval_db"]
 
     @property
     def disparity(self) -> NDArray[np.floating] | None:
         """Disparity (y, x) of the centre view, pixels per view step; None without an estimate.
 
-        None where views are bands or times: `maps` has a `shift` then, pixels from one to the next.
+        Also None where views are bands or times; `maps` may then hold `shift`, in pixels from one
+        band or time to the next.
         """
         return self.maps.get("disparity")
 
     @cached_property
     def misfit(self) -> NDArray[np.float32]:
-        """How far readings are missed around each place (y, x), in deviations: about 1 is right."""
+        """Residual of the readings around each sample (y, x), over their deviation; about 1."""
         psi, frames, count = self.psi, self.frames, self.psi.shots
         if "moved_px" in self.solved.parameters and count > 1:
             # The scene moved: it is the light field of the first shot's time.
@@ -169,7 +184,7 @@ class Result(LightFieldArray):
 
     @property
     def status(self) -> str:
-        """How the solver ended; "converged", or what `advice` has a remedy for."""
+        """How the solver ended: a value of `Status`, such as "converged"."""
         return self.solved.status
 
     @property
@@ -179,19 +194,26 @@ class Result(LightFieldArray):
 
     @property
     def seconds(self) -> float:
-        """How long the method took, without the compilation of its kernels."""
+        """Seconds that the method took, without the compilation of its kernels."""
         return self.solved.seconds
 
     def compare(self, truth: ArrayLike) -> dict[str, float]:
-        """Return how near the estimate is to the true light field (v, u, y, x, c).
+        """Return the accuracy of the estimate against the true light field.
 
-        psnr_db, ssim: of all measured views and colours, peak 1. replicate_psnr_db: that of the
-        true centre view copied to all views, which a light field has to beat.
+        Args:
+            truth: a scene, or an array (v, u, y, x, c), linear RGB in [0, 1].
+
+        Returns:
+            `psnr_db` and `ssim` over all measured views and colours, peak 1; `replicate_psnr_db`,
+            the PSNR of the true centre view in all places, which a light field has to beat.
+
+        Raises:
+            SceneError: a truth of another shape.
         """
         return compared(self.light_field, np.asarray(truth), self.solved.measured)
 
     def metrics(self) -> dict[str, Any]:
-        """Return the figures of the reconstruction, as metrics.json has them."""
+        """Return the figures of the reconstruction, with the keys of metrics.json."""
         return {
             **figures(self.solved, self.verdict, self.frames, self.settings),
             **self.solved.stated,
@@ -208,10 +230,17 @@ class Result(LightFieldArray):
         return self.psi.view_axes
 
     def save(self, out: str | Path) -> None:
-        """Write the result as a folder, which `emmc_rig.open_result` opens: report.html, light
-        field, maps, metrics, and the frames and Psi that it follows from.
+        """Write the result as a folder, which `emmc_rig.open_result` opens.
 
-        An earlier result of that name is replaced; raises AppError where something else is there.
+        It holds report.html, light_field.h5, maps.h5, metrics.json, and the frames and Psi that the
+        result follows from, frames.h5 and psi.h5. An earlier result in the folder is replaced.
+
+        Args:
+            out: the folder; made if missing.
+
+        Raises:
+            AppError: a folder that holds anything else, or that cannot be written.
+            ArgumentError: no path.
         """
         out = path_of(out, "out", "the folder to write")
         with result_folder(out, "reconstruct") as folder:
@@ -277,9 +306,12 @@ class Result(LightFieldArray):
         truth: ArrayLike | None = None,
         settings: FigureSettings | None = None,
     ) -> Figure:
-        """Draw view, close-ups, epipolar image, error and maps, beside other results' of one scene.
+        """Return a figure of matplotlib: view, close-ups, epipolar image, error and maps.
 
-        truth: the true light field (v, u, y, x, c). settings: what is shown of each.
+        Args:
+            others: results of the same scene, drawn beside.
+            truth: the true light field (v, u, y, x, c), for the errors. None: no errors are drawn.
+            settings: what is shown, see `emmc_rig.report.result_figure`. None: the defaults.
         """
         from emmc_rig.report.result_figure import draw_results  # matplotlib loads for a second
 
@@ -306,9 +338,9 @@ class Result(LightFieldArray):
         )
 
     def viewer(self, truth: ArrayLike | None = None) -> str:
-        """Return a page to turn, focus and look into: one HTML file that opens offline.
+        """Return the viewer as the text of an HTML page, which opens offline.
 
-        truth: the true light field, to wipe against.
+        truth: the true light field (v, u, y, x, c), to compare with. None: no comparison.
         """
         from emmc_rig.report.viewer import render_viewer  # as its templates are
 
@@ -415,14 +447,17 @@ def _measured(outside: Any, views: tuple[int, ...]) -> NDArray[np.bool_] | None:
 
 
 def open_result(folder: str | Path) -> Result:
-    """Return a result that `Result.save` wrote, or `emmc-rig reconstruct` or `demo`.
+    """Return a result that `Result.save`, `emmc-rig reconstruct` or `emmc-rig demo` wrote.
 
     Args:
-        folder: of the result, or of one frame of a film, or a session with its light field.
+        folder: the folder of the result, of one frame of a film, or of a session with its result.
+
+    Returns:
+        The result; its Psi and frames are read when they are first used, and raise AppError where
+        the folder has none (earlier versions kept no frames).
 
     Raises:
-        AppError: the folder holds no result, or a damaged one. The result's `psi` and `frames`
-            raise it where the folder has none: earlier versions kept no frames.
+        AppError: the folder holds no result, or a damaged one.
         ArgumentError: no path.
 
     >>> import emmc_rig as emmc

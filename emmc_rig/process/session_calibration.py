@@ -72,11 +72,14 @@ class GivenFrame:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SessionCalibration:
-    """Psi as whiteboards measure it, those of a session or arrays.
+    """Psi measured from whiteboards, of a session or given as arrays; see `emmc_rig.calibrate`.
 
-    outcome: all methods tried, and the choice among them. calibration: the one chosen, of the shots
-    that the session has. scale: what makes readings of raw frames by it. metrics: what metrics.json
-    says. inputs: what Psi follows from, for `store.products`; None of arrays.
+    outcome: all methods tried, and the choice among them.
+    calibration: the chosen one, of the shots that the session has.
+    scale: converts raw frames to readings.
+    metrics: the figures, with the keys of metrics.json.
+    sensor: figures of the sensor, where they were measured.
+    inputs: what Psi follows from, for `store.products`; None with arrays.
     """
 
     outcome: Outcome
@@ -88,20 +91,24 @@ class SessionCalibration:
 
     @property
     def psi(self) -> Psi:
-        """The imaging matrix of the session's shots."""
+        """The measured imaging matrix; it maps (v, u, y, x, c) to (shot, pixel_y, pixel_x)."""
         return self.calibration.psi
 
     @property
     def held_out_error(self) -> float:
-        """Relative error at which the validation whiteboard is predicted."""
+        """Relative error of the predicted validation whiteboard; 0.01 is one per cent."""
         return self.outcome.judged[self.outcome.chosen].relative_error
 
     def frames(self, dn: ArrayLike, exposures_s: float | Sequence[float] = 1.0) -> Frames:
-        """Return the readings of raw frames by these whiteboards, with deviations.
+        """Return the readings of raw frames, with their deviations, for `emmc_rig.reconstruct`.
 
-        dn: (shot, pixel_y, pixel_x), of the shots of Psi. exposures_s: of all, or of each, in the
-        unit of the whiteboards' exposures. Raises ReconstructionError for another shape,
-        ArgumentError for values other than numbers.
+        Args:
+            dn: raw values, DN, (shot, pixel_y, pixel_x), of the shots of Psi.
+            exposures_s: of all shots, or of each, in the unit of the whiteboards' exposures.
+
+        Raises:
+            ReconstructionError: another shape than Psi's frames.
+            ArgumentError: values other than numbers.
         """
         taken = numbers_of(dn, "dn", "raw values, an array (shot, pixel_y, pixel_x)")
         check_frames(self.psi.frames_shape, taken)
@@ -115,9 +122,13 @@ class SessionCalibration:
         return self.scale.frames(lambda shot: [raw[shot]])
 
     def save(self, out: str | Path) -> None:
-        """Write psi.h5, calibration.h5, metrics.json and report.html as the folder `out`.
+        """Write psi.h5, calibration.h5, metrics.json and report.html into a folder.
 
-        An earlier result of that name is replaced; raises AppError where something else is there.
+        Args:
+            out: the folder; made if missing. An earlier calibration in it is replaced.
+
+        Raises:
+            AppError: a folder that holds anything else, or that cannot be written.
         """
         place = Path(self.metrics["session"]) / CALIBRATION
         with result_folder(Path(out), "calibrate", belongs_to=place) as folder:

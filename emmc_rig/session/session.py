@@ -109,9 +109,16 @@ class Frozen:
 
 
 class Session:
-    """An open session. One program at a time may add to it: see `lock.held`.
+    """A session: the folder of a capture or an import, opened by `Session(folder)`.
 
+    One program at a time may add to it: see `lock.held`.
+
+    folder: its absolute path. journal: what happened, entry by entry.
     means: of frames, by their ids and SHA-256, so that each is decoded once: see `frame_means`.
+
+    Raises:
+        AppError: a folder that is no session, or cannot be read.
+        ArgumentError: no path.
     """
 
     def __init__(self, folder: str | Path, disk: Disk = SYSTEM_DISK) -> None:
@@ -253,7 +260,7 @@ class Session:
 
     @cached_property
     def plan_yaml(self) -> str:
-        """The plan as the user wrote it, the last time."""
+        """The text of the plan that holds, as the user wrote it (YAML)."""
         return self.holding(PLAN).decode()
 
     def plan_data(self) -> object:
@@ -275,7 +282,10 @@ class Session:
 
     @cached_property
     def frames(self) -> tuple[PlannedFrame, ...]:
-        """Every frame to be taken, in the order of the capture."""
+        """All planned frames in the order of the capture: id, kind, exposure, bench positions.
+
+        Raises AppError where the list was changed or damaged.
+        """
         name = amended_name(ORDER, self.amendments)
         try:
             return tuple(PlannedFrame.from_dict(frame) for frame in self._data(name))
@@ -286,7 +296,7 @@ class Session:
 
     @cached_property
     def stored(self) -> dict[str, FrameEntry]:
-        """The journal line of every frame that counts, by its id, kept up to date."""
+        """The journal's entry of each captured frame by its id: file, SHA-256, time, positions."""
         return count_stored(self.journal.entries)
 
     @property

@@ -30,6 +30,22 @@ def leftovers(folder):
 
 
 @pytest.mark.slow
+def test_a_picture_is_drawn_without_a_word_on_a_home_that_takes_no_files(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("HOME", str(tmp_path / "file/home"))
+    for name in ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    drawn = subprocess.run(
+        [*PROGRAM, "cameras", "rgbw-bayer-1shot", "--out", "drawn"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert (drawn.returncode, drawn.stderr) == (0, "")
+    assert (tmp_path / "drawn/camera.png").is_file()
+
+
+@pytest.mark.slow
 def test_the_demo_writes_a_whole_result(run, tmp_path):
     out = done(run("demo", *SMALL, "--shots", 1, "--out", "result"))
     assert "dB" in out

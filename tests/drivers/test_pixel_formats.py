@@ -1,5 +1,9 @@
 """Pixel formats: every kernel agrees with a plain twin, on every size and packing."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -78,3 +82,15 @@ def test_the_deepest_and_smallest_formats_come_first():
 def test_too_few_bytes_are_refused():
     with pytest.raises(ValueError, match="17 bytes are fewer than the 18"):
         unpack(bytes(17), BY_NAME["Mono12p"], (3, 4))
+
+
+def test_pixels_are_unpacked_where_no_folder_takes_machine_code():
+    # The home is read-only, and another user installed the package.
+    program = (
+        "from emmc_rig.drivers.pixel_formats import BY_NAME, unpack\n"
+        "print(unpack(bytes((0x23, 0xC1, 0xAB)), BY_NAME['Mono12p'], (1, 2)).tolist())\n"
+    )
+    no_folder = {**os.environ, "NUMBA_CACHE_LOCATOR_CLASSES": "IPythonCacheLocator"}
+    command = [sys.executable, "-c", program]
+    ran = subprocess.run(command, capture_output=True, text=True, env=no_folder)
+    assert (ran.stdout.strip(), ran.stderr) == (str([[0x123, 0xABC]]), "")
