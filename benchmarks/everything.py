@@ -104,7 +104,8 @@ def design(name: str) -> None:
     for (sensor, shots), cfa in DESIGNED.items():
         bench = WORK / f"bench-{sensor}-{shots}.yaml"
         bench.parent.mkdir(parents=True, exist_ok=True)
-        bench.write_text(yaml.safe_dump({"sensor": {"cfa": cfa}, "shots": shots}), "utf-8")
+        sensor = {"sensor": {"cfa": cfa}} if cfa else {}
+        bench.write_text(yaml.safe_dump({**sensor, "shots": shots}), "utf-8")
         out = program("design", str(bench), "--size", "96x96", *scenes("B"))
         found = json.loads((out / "metrics.json").read_text("utf-8"))
         (_, own_db), *shipped = [

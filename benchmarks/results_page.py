@@ -594,9 +594,8 @@ FAULTS = {
 
 def breaking() -> Section:
     """From which strength a fault costs 3 dB."""
-    rows = where(rows_of("stability-real-breaking"), screened="True")
-    rows = [row for row in rows if row["scene"] != "all scenes"]
-    found = where(rows_of("stability-real"), screened="True")
+    rows = [row for row in rows_of("stability-real-breaking") if row["scene"] != "all scenes"]
+    found = rows_of("stability-real")
     table = [("fault", "`adaptive-fast`, median (least, most)", "`tv`, median")]
     charts: dict[str, str] = {}
     for fault, words in FAULTS.items():
@@ -619,7 +618,8 @@ def breaking() -> Section:
     return Section(
         "Which strength of a fault costs 3 dB?",
         "The strength depends on the scene: a mask shift costs 3 dB from "
-        f"{shifts[strict]:.2g} pixels in {strict}, and from {shifts[mild]:.2g} pixels in {mild}.",
+        f"{shifts[strict]:.2g} pixels in {strict.split('@')[0]}, and from {shifts[mild]:.2g} pixels in "
+        f"{mild.split('@')[0]}.",
         f"The table lists the strengths that cost 3 dB, over {len(shifts)} light fields, 48x64, "
         "three shots, after frame clean-up. Each chart shows a fault: thick lines are means, thin "
         "lines `adaptive-fast` on single light fields.",
