@@ -617,8 +617,8 @@ def breaking() -> Section:
     strict, mild = min(shifts, key=shifts.__getitem__), max(shifts, key=shifts.__getitem__)
     return Section(
         "Which strength of a fault costs 3 dB?",
-        "The strength depends on the scene: a mask shift costs 3 dB from "
-        f"{shifts[strict]:.2g} pixels in {strict.split('@')[0]}, and from {shifts[mild]:.2g} pixels in "
+        f"The strength depends on the scene: a mask shift costs 3 dB from {shifts[strict]:.2g} "
+        f"pixels in {strict.split('@')[0]}, and from {shifts[mild]:.2g} pixels in "
         f"{mild.split('@')[0]}.",
         f"The table lists the strengths that cost 3 dB, over {len(shifts)} light fields, 48x64, "
         "three shots, after frame clean-up. Each chart shows a fault: thick lines are means, thin "
