@@ -20,7 +20,10 @@ FITTING = (
     "simulators/raycaster.py", "simulators/textures.py",
 )  # fmt: skip
 """Files and folders whose code decides what a reconstruction measures."""
-CALIBRATING = (*FITTING, "calibration", "simulators", "emmc_rig/captures", "emmc_rig/process")
+CALIBRATING = (
+    *FITTING, "calibration", "simulators", "emmc_rig/bench/hardware.py", "emmc_rig/captures",
+    "emmc_rig/process",
+)  # fmt: skip
 """The same for a calibration of simulated benches."""
 RESULTS = ROOT / "docs" / "results"
 

@@ -636,21 +636,25 @@ def _view_terms(mask: ShadowMask, point: _Point, samples: Sequence[Sample]) -> _
 
 
 def _bias_covariance(
-    covariance: Array, terms: _ViewTerms
+    covariance: Array, terms: _ViewTerms, held: Array
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Return what the views' own displacements and softenings add to a covariance C.
 
     Beside it, their variances tau^2, (OF_VIEW,), um^2.
 
         left = own - mixed^T C mixed         information that the placement leaves to the views' own
-        evidence(tau) = 1/2 q^T (1 + T left T)^-1 q - 1/2 log|1 + T left T|,    q = T pull
+        rest = pull - mixed^T C held         and what pulls them
+        evidence(tau) = 1/2 q^T (1 + T left T)^-1 q - 1/2 log|1 + T left T|,    q = T rest
         tau^2 = mean over the grid TAUS_UM, weighed by exp(evidence) and the half-t prior
         added = C mixed diag(tau^2) mixed^T C
 
-    T is diag(tau), a tau of each kind (see KINDS). covariance: without the views' own.
+    T is diag(tau), a tau of each kind (see KINDS). covariance: without the views' own. held:
+    gradient by all other parameters. Only a parameter at its limit has a gradient: without `held`,
+    a mask without any blur seems blurred view by view.
     """
     mixed, own, pull = terms
     left = own - mixed.T @ covariance @ mixed
+    pull = pull - mixed.T @ (covariance @ held)
     kind = np.resize(KINDS, len(pull))
     assert len(pull) % OF_VIEW == 0
     evidence, squares = [], []
@@ -1050,7 +1054,8 @@ def _covariance(
     """
     information = point.normal.matrix + prior.precision
     covariance = np.asarray(np.linalg.inv(information), np.float64)
-    of_views, astray2 = _bias_covariance(covariance, _view_terms(mask, point, samples))
+    held = point.normal.gradient + prior.precision @ (prior.centre - point.state.vector())
+    of_views, astray2 = _bias_covariance(covariance, _view_terms(mask, point, samples), held)
     return covariance + of_views + _references_covariance(point, samples, covariance), astray2
 
 

@@ -307,7 +307,10 @@ def simulated_rig(
         for name, um in middle_um.items()
         if name in fitted.names
     }
-    by_hand_um = {name: 0.0 for name in STAGE_AXES if name not in fitted.names}
+    # Without an axis that moves it, no plate is mounted before a hand puts it there.
+    window_um = 2 * aperture_um
+    begun_um = {"aperture_x": window_um}
+    by_hand_um = {name: begun_um.get(name, 0.0) for name in STAGE_AXES if name not in fitted.names}
 
     def positions_um() -> dict[str, float]:
         real = {name: chain.position_um(*address) for name, address in axes.items()}
@@ -315,7 +318,6 @@ def simulated_rig(
         centred_um = middle_um if focus_um is None else middle_um | {FOCUS: focus_um}
         return {name: um - centred_um[name] for name, um in real.items()} | by_hand_um
 
-    window_um = 2 * aperture_um
     rng = np.random.default_rng(seed)
     optics = replace(flaws.optics, pupil=flaws.optics.pupil or default_pupil(camera))
     bench = Bench(

@@ -1,6 +1,9 @@
 """Whatever axes and camera a bench has, the commands of docs/day-one.md lead to a light field."""
 
 import json
+import re
+import shlex
+from pathlib import Path
 
 import pytest
 import yaml
@@ -85,3 +88,23 @@ def test_a_bench_comes_to_a_light_field(axes, camera, planned, tmp_path, run):
     did("reconstruct", folder, "--method", "adaptive-fast")
     verdict = json.loads((folder / "reconstruction" / "metrics.json").read_text())["verdict"]
     assert verdict["level"] != "do not use", verdict["reasons"]
+
+
+@pytest.mark.slow
+def test_day_one_as_typed_ends_in_good_calibrations(tmp_path, monkeypatch, run):
+    page = (Path(__file__).parents[2] / "docs" / "day-one.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for name, text in re.findall(r"```yaml\n# (\S+)\n(.*?)```", page, re.DOTALL):
+        Path(name).write_text(text, encoding="utf-8")
+    commands = re.findall(r"^emmc-rig (.+)$", page[page.index("**Third hour") :], re.MULTILINE)
+    assert len(commands) == 8
+    for command in commands:
+        done(run(*shlex.split(command)))
+    for folder, least, most in (("two", 1.0, 2.5), ("none", 3.0, 5.0)):
+        found = json.loads(Path(folder, "calibration", "metrics.json").read_text())
+        stated = re.match(r"calibration good: .* error stated ([\d.]+)%", found["why"])
+        assert stated, found["why"]
+        assert least < float(stated[1]) < most
+        assert not any("distance differs" in line for line in found["findings"]), folder
+        rebuilt = json.loads(Path(folder, "reconstruction", "metrics.json").read_text())
+        assert rebuilt["verdict"]["level"] == "trust", folder
