@@ -84,8 +84,13 @@ class Helpers(event.Listener):
 
 
 @contextmanager
-def helped_to_compile(method: str, camera: str, shots: int | None) -> Iterator[None]:
-    """Have other processes compile, too, while a run reconstructs by this method and camera."""
+def helped_to_compile(
+    method: str, camera: str = "rgbw-bayer-1shot", shots: int | None = None
+) -> Iterator[None]:
+    """Have other processes compile, too, while a run reconstructs by this method and camera.
+
+    The kernels of one camera are those of nearly all.
+    """
     arguments = (camera, *(() if shots is None else (str(shots),)))
     with (
         ExitStack() as ended,

@@ -77,7 +77,7 @@ def live(
     ] = False,
     browser: Annotated[bool, typer.Option("--open", help="open the page in a browser")] = False,
 ) -> None:
-    """Set up the bench on a local page: centre the mask, expose, align, focus, save.
+    """Set up the bench on a local page: centre the mask, exposure, align, focus, save.
 
     It shows the light field too, where Psi is known. Ctrl-C ends.
     """

@@ -87,6 +87,7 @@ def reconstruct(
         return
     if frames is not None and len(frames) == 1:
         refuse_missing(frames[0], WRITTEN_BY)  # before the methods load, for a second
+    from emmc_rig.commands.first_run import helped_to_compile
     from emmc_rig.process.captures import opened_capture
     from emmc_rig.process.cost import method_within, parse_memory
     from emmc_rig.process.reconstructing import load_settings, reconstruct_captures
@@ -136,7 +137,7 @@ def reconstruct(
     if dictionary is not None and not find_method(method).needs_dictionary:
         raise typer.BadParameter(f"--dictionary: no effect on --method {method}; leave it out")
     places = _places(captures, out if frame is None else out or DEFAULT)
-    with shown_progress() as bars:
+    with shown_progress() as bars, helped_to_compile(method):
         bars.begin(method if len(places) == 1 else f"{method}, {len(places)} captures", None)
         outcomes = list(
             reconstruct_captures(
@@ -177,10 +178,11 @@ def _film(capture: Any, out: Path, strict: bool, **given: Any) -> None:
 
     capture: a `SessionCapture`.
     """
+    from emmc_rig.commands.first_run import helped_to_compile
     from emmc_rig.process.filming import reconstruct_film_session
     from emmc_rig.store.results import shown_seconds, stated_words
 
-    with shown_progress(given["method"]) as bars:
+    with shown_progress(given["method"]) as bars, helped_to_compile(given["method"]):
         metrics = reconstruct_film_session(capture, out, watcher=bars, **given)
     film = metrics["film"]
     if "assumed" in metrics:

@@ -152,7 +152,7 @@ def test_the_commands_take_a_plug_in_as_any_other_stage(installed, run):
     assert (code, error.count("\n")) == (1, 1)
     assert "nobody:" in error
     code, _, error = run("devices", "conform", "ptp:", "--as", "stage")
-    assert (code, error) == (1, "emmc-rig: --as stage: ptp: is a camera\n")
+    assert (code, error) == (1, "emmc-rig: --as stage: ptp: is a camera: leave --as out\n")
 
 
 def conform(installed, *arguments, answer=""):

@@ -404,7 +404,7 @@ MISTAKES = {
     ),
     "pixels that cut samples": (
         lambda t: api.Psi.from_weights(np.ones((1, 1, 1, 5, 6)), binning=2),
-        r"pixels of 2\^2 samples do not divide \(5, 6\)",
+        r"pixels of 2x2 samples do not divide \(5, 6\)",
     ),
     "a mask of three values a cell by twos": (
         lambda t: api.camera({**CAMERA, "masks": {"code": mask_of(np.ones((4, 4, 2)))}}),

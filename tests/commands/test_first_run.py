@@ -6,9 +6,10 @@ import sys
 
 import pytest
 from numba import njit
-from programs import wait_until
+from programs import done, wait_until
 
 from emmc_rig.commands import first_run
+from emmc_rig.process import reconstructing
 from emmc_rig.reconstruction import kernels
 from emmc_rig.reconstruction.adaptive import evidence, rays
 
@@ -45,6 +46,25 @@ def test_other_processes_compile_meanwhile_and_end_with_the_run(started, capsys)
     assert all(process.poll() is not None for _, process in started)
     assert parts(started) == [[part, "rgbw-mono", "2"] for part in first_run.PARTS["adaptive"]]
     assert capsys.readouterr().err.count("compiling the methods for this machine, once") == 1
+
+
+def test_reconstruct_says_that_it_compiles(monkeypatch, tmp_path, run):
+    asked = []
+    monkeypatch.setattr(first_run.Helpers, "_start", lambda self, parts: asked.append(parts))
+
+    @njit
+    def fourth(x):
+        return x / 4
+
+    def compiled(*given, **more):
+        fourth(3.0)
+        return []
+
+    monkeypatch.setattr(reconstructing, "reconstruct_captures", compiled)
+    done(run("simulate", "--size", "32x40", "--out", tmp_path / "frames"))
+    _, _, err = run("reconstruct", tmp_path / "frames", "--method", "tv")
+    assert err.count("compiling the methods for this machine, once") == 1
+    assert asked == ["tv"]
 
 
 @pytest.mark.parametrize(

@@ -65,8 +65,8 @@ def filled(place):
 
 
 SITUATIONS = {
-    "holds something": (filled, "own: holds something already; name another folder"),
-    "a file": (lambda place: place.write_text("mine"), "own: a file, where a folder is meant"),
+    "holds something": (filled, "own: holds something already; choose another folder"),
+    "a file": (lambda place: place.write_text("mine"), "own: a file of that name exists; choose another folder"),
     "below a file": (
         lambda place: place.symlink_to(Path(__file__) / "x"), "own: cannot be",
     ),
