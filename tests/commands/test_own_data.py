@@ -66,7 +66,7 @@ def filled(place):
 
 SITUATIONS = {
     "holds something": (filled, "own: holds something already; choose another folder"),
-    "a file": (lambda place: place.write_text("mine"), "own: a file of that name exists; choose another folder"),
+    "a file": (lambda place: place.write_text("mine"), "own: a file of that name exists"),
     "below a file": (
         lambda place: place.symlink_to(Path(__file__) / "x"), "own: cannot be",
     ),
