@@ -89,7 +89,7 @@ def helped_to_compile(
 ) -> Iterator[None]:
     """Have other processes compile, too, while a run reconstructs by this method and camera.
 
-    The kernels of one camera are those of nearly all.
+    Nearly all cameras need the same kernels.
     """
     arguments = (camera, *(() if shots is None else (str(shots),)))
     with (
