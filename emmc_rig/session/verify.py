@@ -60,7 +60,7 @@ class Verdict:
             shown = ", ".join(self.missing[:5]) + (", ..." if len(self.missing) > 5 else "")
             yield f"{len(self.missing)} of {self.planned} frames not captured yet: {shown}"
         if self.spared:
-            yield f"not needed, by the shots so far or by metering: {self.spared} more of the planned frames"
+            yield f"not needed: {self.spared} more of the planned frames"
         if self.dropped:
             yield f"dropped from the film: {self.dropped} of its frames, named in the journal"
         if self.unreadable:

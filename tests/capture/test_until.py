@@ -113,7 +113,7 @@ def test_a_session_ends_when_the_scene_needs_no_more_shots(enough):
 
 def test_show_verify_and_list_take_a_session_that_ended_early_as_complete(enough):
     out = done(program("session", "verify", enough))
-    assert "not needed, by the shots so far or by metering: 2 more of the planned frames" in out
+    assert "not needed: 2 more of the planned frames" in out
     _, out, _ = program("session", "show", enough)
     assert "shot         1 of 1" in out
     assert "target 12 dB; done, the target is reached" in out
