@@ -93,8 +93,8 @@ class Dictionary:
         v, u, _, _, colours = self.patch_shape
         if (v, u) != tuple(views) or colours != 3:
             raise DictionaryError(
-                f"views and colours of the dictionary's patches: {v}x{u} and {colours}, not "
-                f"{views[0]}x{views[1]} and 3: train or choose a dictionary for these views"
+                f"the dictionary's patches have {v}x{u} views (colours: {colours}), not "
+                f"{views[0]}x{views[1]} (colours: 3): train or choose a dictionary for these views"
             )
 
     def save(self, path: str | os.PathLike) -> None:
