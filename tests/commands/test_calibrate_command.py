@@ -136,7 +136,7 @@ def test_psi_is_within_a_percent_and_its_deviation_true_whatever_is_wrong_with_t
 ):
     camera = find_camera(str(camera_file))
     bench = flawed(Flaws(), flaws)
-    settings = CalibrateSettings("small", camera, (48, 64), flaws=bench, rays=256)
+    settings = CalibrateSettings("small", camera, (48, 64), flaws=bench, rays=512)
     metrics = calibrate_simulated(settings).found.metrics
     chosen = metrics["chosen"]
     stated, covered = metrics["psi_stated_error"][chosen], metrics["psi_coverage"][chosen]
