@@ -31,7 +31,7 @@ from measured_code import COMMIT, commit_of_code, rooms_of, stale
 WORK = Path(lab.RESULTS.parents[1], "emmc-everything")
 ONE_SHOT, THREE_SHOTS = "rgbw-bayer-1shot", "rgbw-bayer-3shots"
 DESIGNED = {
-    ("monochrome", 3): None, ("monochrome", 1): None, ("Bayer", 3): "rggb", ("Bayer", 1): "rggb",
+    ("monochrome", 3): "mono", ("monochrome", 1): "mono", ("Bayer", 3): "rggb", ("Bayer", 1): "rggb",
 }  # fmt: skip
 """Colour filters of the sensors and shots that a mask is designed for."""
 LARGE = (("8", "2448x3264", "adaptive-fast"), ("8", "2448x3264", "adaptive"),
@@ -104,8 +104,7 @@ def design(name: str) -> None:
     for (sensor, shots), cfa in DESIGNED.items():
         bench = WORK / f"bench-{sensor}-{shots}.yaml"
         bench.parent.mkdir(parents=True, exist_ok=True)
-        sensor = {"sensor": {"cfa": cfa}} if cfa else {}
-        bench.write_text(yaml.safe_dump({**sensor, "shots": shots}), "utf-8")
+        bench.write_text(yaml.safe_dump({"sensor": {"cfa": cfa}, "shots": shots}), "utf-8")
         out = program("design", str(bench), "--size", "96x96", *scenes("B"))
         found = json.loads((out / "metrics.json").read_text("utf-8"))
         (_, own_db), *shipped = [

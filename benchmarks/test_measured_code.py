@@ -1,10 +1,15 @@
 """Rows are of other code once that code changes, and only then."""
 
+import json
 import subprocess
+from pathlib import Path
 
+import everything
 import measured_code
 import pytest
 import results_page
+
+from emmc_rig.study.design.bench import load_bench
 
 BEFORE = '"""Words."""\n\nLIMIT = 3\n"""Of what."""\nif not LIMIT:\n    raise ValueError("no")\n'
 BEFORE += 'NAME = "tv"\nprint(f"no limit: {LIMIT}")\n'
@@ -74,3 +79,26 @@ def test_the_page_is_not_written_from_rows_of_other_code_but_as_a_draft(monkeypa
     monkeypatch.setattr("sys.argv", ["results_page.py", "--draft"])
     results_page.main()
     assert written
+
+
+def test_masks_are_designed_for_the_sensors_that_the_rows_name(tmp_path, monkeypatch):
+    seen = []
+
+    def program(command, bench, *words):
+        seen.append(load_bench(Path(bench)))
+        found = [{"name": name, "psnr_db": {"scene": db}} for name, db in (("own", 1), ("b", 2))]
+        text = json.dumps({"simulated": found, "manufacturing_db": {"RGBW": 0}})
+        (tmp_path / "metrics.json").write_text(text)
+        return tmp_path
+
+    stored = {}
+    monkeypatch.setattr(everything, "WORK", tmp_path)
+    monkeypatch.setattr(everything, "program", program)
+    monkeypatch.setattr(everything, "scenes", lambda group: [])
+    monkeypatch.setattr(everything, "store", lambda name, rows, command: stored.update(rows=rows))
+    everything.design("design")
+    kinds = {"mono": "monochrome", "rggb": "Bayer"}
+    assert [(kinds[bench.sensor.cfa_name], bench.shots) for bench in seen] == [
+        (row["sensor"], row["shots"]) for row in stored["rows"]
+    ]
+    assert {row["best_shipped"] for row in stored["rows"]} == {"b"}

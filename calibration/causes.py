@@ -62,7 +62,7 @@ SIZE = "size"
 OF_HOLES = (HANDS, HOLES, EXPOSURE, PLATE, SIZE, TURN)
 """Causes of whiteboards through the pinhole alone."""
 OF_LIGHT = (LAMP, HOLES, EXPOSURE, SIZE)
-"""Causes of brightness alone."""
+"""Causes by which whiteboards are brighter or darker."""
 OF_PLATE = (HANDS, PLATE, TURN)
 """Causes by which pinholes stand off their holes."""
 SHIFTING = (STAGE, HANDS, HOLES, PLATE, SIZE, TURN)

@@ -309,8 +309,8 @@ def simulated_rig(
     }
     # Without an axis that moves it, no plate is mounted before a hand puts it there.
     window_um = 2 * aperture_um
-    begun_um = {"aperture_x": window_um}
-    by_hand_um = {name: begun_um.get(name, 0.0) for name in STAGE_AXES if name not in fitted.names}
+    begun_um = dict.fromkeys(STAGE_AXES, 0.0) | {"aperture_x": window_um}
+    by_hand_um = {name: um for name, um in begun_um.items() if name not in fitted.names}
 
     def positions_um() -> dict[str, float]:
         real = {name: chain.position_um(*address) for name, address in axes.items()}
