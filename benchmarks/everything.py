@@ -31,7 +31,8 @@ from measured_code import COMMIT, commit_of_code, rooms_of, stale
 WORK = Path(lab.RESULTS.parents[1], "emmc-everything")
 ONE_SHOT, THREE_SHOTS = "rgbw-bayer-1shot", "rgbw-bayer-3shots"
 DESIGNED = {
-    ("monochrome", 3): "mono", ("monochrome", 1): "mono", ("Bayer", 3): "rggb", ("Bayer", 1): "rggb",
+    ("monochrome", 3): "mono", ("monochrome", 1): "mono",
+    ("Bayer", 3): "rggb", ("Bayer", 1): "rggb",
 }  # fmt: skip
 """Colour filters of the sensors and shots that a mask is designed for."""
 LARGE = (("8", "2448x3264", "adaptive-fast"), ("8", "2448x3264", "adaptive"),
