@@ -123,7 +123,7 @@ class Size:
 
 FULL = {
     "psi": Size((192, 256), 512),
-    "hands": Size((48, 64), 1024),
+    "hands": Size((48, 64), 4096),
     "few": Size((96, 128), 4096),
     "effects": Size((48, 64), 1024),
     "session": Size((48, 64), 1024),

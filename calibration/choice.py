@@ -19,6 +19,8 @@ OPEN = "open aperture"
 """The kind of held-out whiteboards that judges every route."""
 LARGEST_CHI2 = 1.5
 """Mean squared residual over the variance: what is left is less than the noise."""
+LARGEST_STATED = 0.05
+"""Of Psi, relative: less costs a reconstruction below 0.5 dB (`benchmarks/mismatch.py`)."""
 ROUTES = ("parametric", "mixed", "combined", "free")
 """From the simplest to the freest."""
 SURE, LEAST_EXCESS = 5.0, 0.05
@@ -144,8 +146,8 @@ def _likeliest_excess(board: Board, predicted: Array, spread: Array, unsteady: f
     return light / (light2 + unsteady**-2)
 
 
-def choose(judged: Sequence[HeldOut], stated: Mapping[str, float]) -> tuple[HeldOut, str]:
-    """Return the description to use, and why in words.
+def choose(judged: Sequence[HeldOut], stated: Mapping[str, float]) -> HeldOut:
+    """Return the description to use.
 
     No method has fitted the open whiteboard. Among the methods whose residual there is noise, the
     method of the least stated error is chosen. stated: relative error that each states of its Psi,
@@ -156,18 +158,21 @@ def choose(judged: Sequence[HeldOut], stated: Mapping[str, float]) -> tuple[Held
     known = sorted(judged, key=lambda held: (stated[held.route], ROUTES.index(held.route)))
     good = [held for held in known if held.chi2 <= LARGEST_CHI2]
     if not good:
-        best = min(known, key=lambda held: held.chi2)
-        return best, (
-            f"calibration doubtful: {_state_residual(best)}; the deviation of Psi includes the "
-            "residual"
-        )
+        return min(known, key=lambda held: held.chi2)
     # Of n normal residuals the mean square is 1 to a deviation of sqrt(2 / n).
     chance = SURE * np.sqrt(2 / max(int(np.count_nonzero(good[0].residual)), 1))
     sure = [held for held in good if held.groups.get(OPEN, held.chi2) < 1 + chance + LEAST_EXCESS]
-    held = (sure or good)[0]
-    return held, (
-        f"calibration good: {_state_residual(held)}, error stated {stated[held.route]:.2%}"
-    )
+    return (sure or good)[0]
+
+
+def explain(chosen: HeldOut, error: float) -> str:
+    """Return how good the chosen description is, in words; error: relative, stated of its Psi."""
+    residual, stated = _state_residual(chosen), f"error stated {error:.2%}"
+    if chosen.chi2 > LARGEST_CHI2:
+        return f"calibration doubtful: {residual}, {stated}, which includes the residual"
+    if error > LARGEST_STATED:
+        return f"calibration imprecise: {residual}, {stated} (limit {LARGEST_STATED:.0%})"
+    return f"calibration good: {residual}, {stated}"
 
 
 def _state_residual(held: HeldOut) -> str:

@@ -359,6 +359,14 @@ class _BenchPrior:
             own=own.ravel(),
         )
 
+    def causes_at(self, point: _Point) -> list[Cause]:
+        """Return the possible causes, each with the least width that a fit there tells."""
+        least = LEAST_LIGHT * float(np.sqrt(point.normal.spread**2 - 1))
+        return [
+            replace(cause, least=least) if cause.name in OF_LIGHT else cause
+            for cause in self.causes.values()
+        ]
+
     def with_widths(self, widths: Mapping[str, float], aberrant: bool = False) -> _Prior:
         """Return the prior of all parameters; widths: of the causes, by name, possible or not.
 
@@ -682,11 +690,7 @@ def _find_causes(
     Aberrations displace the shadows of the views as pinholes do that stand off their holes, and
     are tried where something does.
     """
-    least = LEAST_LIGHT * float(np.sqrt(point.normal.spread**2 - 1))
-    causes = [
-        replace(cause, least=least) if cause.name in OF_LIGHT else cause
-        for cause in bench.causes.values()
-    ]
+    causes = bench.causes_at(point)
     own = _own_information(point, bench)
     found = find_causes(own, causes, bench.own2, bench.always)
     if not any(cause.name in SHIFTING for cause in found) or bench.always:
@@ -710,7 +714,7 @@ def _about_pinholes(
 
     def evidence(tried: _BenchPrior) -> float:
         own = OwnInformation(still.information, still.pull - still.information @ tried.own)
-        causes = find_causes(own, list(tried.causes.values()), tried.own2, tried.always)
+        causes = find_causes(own, tried.causes_at(point), tried.own2, tried.always)
         widths = {cause.name: cause.width for cause in causes}
         there = float((still.pull + own.pull) @ tried.own) / 2
         return there + log_evidence(own, covariance_of(tried.causes, widths, tried.own2))

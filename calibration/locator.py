@@ -43,6 +43,7 @@ ORIENTATIONS = {
     "mirrored and turned by 90 degrees": lambda cells: cells.transpose(0, 2, 1, 3),
     "mirrored and turned by 270 degrees": lambda cells: cells.transpose(0, 2, 1, 3)[:, ::-1, ::-1],
 }
+"""Of cells or views, (shot, y, x, colour)."""
 LEVEL_CELLS = 8.0
 """Light varies more slowly than this over the picture, the mask faster."""
 LEAST_LEVEL = 0.05

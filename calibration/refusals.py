@@ -17,7 +17,7 @@ from emmc_rig.calibration.choice import HeldOut
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.fit import Fit
 from emmc_rig.calibration.frames import MeanFrame
-from emmc_rig.calibration.locator import register
+from emmc_rig.calibration.locator import ORIENTATIONS, register
 from emmc_rig.calibration.openings import views_open
 from emmc_rig.calibration.placement import SCALARS, Placement, Tolerances, designed_placement
 from emmc_rig.calibration.robust import correlation, deviation_of
@@ -69,12 +69,6 @@ MIRRORED = 0.02
 """By which the views in another order must correlate better with the design's."""
 SAMPLED, SAMPLED_GRADIENT = 3_000, 200_000
 """Pixels that distinguish whiteboards' views, and brightness over the picture."""
-ORDERS = {
-    "mirrored left to right": lambda opened: opened[:, ::-1],
-    "mirrored top to bottom": lambda opened: opened[::-1],
-    "turned by 180 degrees": lambda opened: opened[::-1, ::-1],
-    "with rows and columns exchanged": lambda opened: opened.T,
-}
 
 
 def refuse_unfit(sets: Sequence[BoardSet]) -> None:
@@ -192,7 +186,8 @@ def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMas
         clearest.append(np.percentile(board.reading[board.usable], 98) / share)
         sample = board.sampled(np.inf, SAMPLED, rng)
         own.append(_correlation(sample, shadow, board.views_open))
-        orders = (turned(board.views_open) for turned in ORDERS.values())
+        opened = board.views_open[None, :, :, None]
+        orders = (turned(opened)[0, :, :, 0] for turned in ORIENTATIONS.values())
         own_shape = board.views_open.shape
         others.append(
             [_correlation(sample, shadow, o) if o.shape == own_shape else -1.0 for o in orders]
@@ -206,7 +201,7 @@ def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMas
         if means.max() > np.mean(own) + MIRRORED:
             raise CalibrationError(
                 "the views are not those that the whiteboards are named for: they are "
-                f"{list(ORDERS)[int(np.argmax(means))]}; check the axes of the aperture's stage"
+                f"{list(ORIENTATIONS)[int(np.argmax(means))]}; check the axes of the aperture's stage"
             )
     return shadow.placement
 

@@ -27,6 +27,7 @@ from emmc_rig.calibration.choice import (
     OPEN,
     HeldOut,
     choose,
+    explain,
     judge,
     predicted_by_psi,
     predicted_by_shadow,
@@ -164,7 +165,7 @@ def calibrate(
     _count_common_errors(task, modelled, psis)
     judged = {name: psi.judged for name, psi in psis.items() if name in routes}
     stated = {name: psi.calibration.stated_error for name, psi in psis.items()}
-    chosen, why = choose(list(judged.values()), stated)
+    chosen = choose(list(judged.values()), stated)
     refusals.refuse_another_bench(chosen)
     if modelled.best is not None and not (levels is not None and levels.bend_known):
         powers = [model.fit.power for model in modelled.models.values()]
@@ -180,7 +181,7 @@ def calibrate(
     findings += _correct_board_and_views(task, modelled, shadow, calibrations, chosen.route)
     return Outcome(
         chosen=chosen.route,
-        why=why,
+        why=explain(chosen, calibrations[chosen.route].stated_error),
         calibrations={name: known for name, known in calibrations.items() if name in routes},
         judged=judged,
         frames={name: psi.exposures for name, psi in psis.items()},

@@ -118,7 +118,8 @@ def _usage_line(fault: typer.BadParameter) -> str:
         return said
     command = fault.ctx.command_path if fault.ctx else "emmc-rig"
     said = said.removeprefix("Invalid value for ").replace("Input should", "should")
-    return f"{said[0].lower()}{said[1:]}; `{command} -h` shows what it takes"
+    joined = "" if said.endswith("?") else ";"
+    return f"{said[0].lower()}{said[1:]}{joined} `{command} -h` shows what it takes"
 
 
 def _typed() -> list[str]:

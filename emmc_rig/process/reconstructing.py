@@ -41,11 +41,7 @@ from emmc_rig.reconstruction.methods import DEFAULT_METHOD, MethodSettings, find
 from emmc_rig.reconstruction.result import Progress
 from emmc_rig.reconstruction.tiles import reconstruct_in_blocks
 from emmc_rig.reconstruction.verdict.run import reconstruct_judged
-from emmc_rig.store.folders import (
-    KEPT,
-    kept_folder,
-    result_folder,
-)
+from emmc_rig.store.folders import KEPT, WRITTEN_BY, kept_folder, refuse_missing, result_folder
 from emmc_rig.store.jobs import kept_words
 from emmc_rig.store.pool import Ceiling, Pool, opened_pool
 from emmc_rig.store.psi import FRAMES, StoredPsi
@@ -491,6 +487,7 @@ def open_frames(
     folder = path_of(folder, "folder", takes)
     if psi is not None:
         psi = path_of(psi, "psi", "the file of a Psi, psi.h5")
+    refuse_missing(folder, WRITTEN_BY)
     if folder.is_file():
         raise AppError(
             f"{folder}: a file; open_frames takes {takes}; readings of your own are given to "

@@ -18,7 +18,7 @@ from whiteboard_bench import (
 
 from emmc_rig.calibration.boards import Board, BoardFrame, BoardSet, as_readings, sensor_blemishes
 from emmc_rig.calibration.causes import HOLES, LAMP, FoundCause, through_pinhole
-from emmc_rig.calibration.choice import HeldOut, choose
+from emmc_rig.calibration.choice import HeldOut, choose, explain
 from emmc_rig.calibration.defects import find_defects
 from emmc_rig.calibration.errors import CalibrationError
 from emmc_rig.calibration.findings import cause_lines, fit_advice
@@ -292,19 +292,24 @@ def test_the_surest_method_that_predicts_to_the_noise_is_chosen():
 
     def pick(**routes):
         held = [judged(route, chi2) for route, (chi2, _) in routes.items()]
-        return choose(held, {route: stated for route, (_, stated) in routes.items()})
+        return choose(held, {route: stated for route, (_, stated) in routes.items()}).route
 
     # 5 sqrt(2 / 4096) = 0.11 is chance.
-    assert pick(free=(1.0, 0.005), parametric=(1.1, 0.001))[0].route == "parametric"
-    assert pick(free=(1.0, 0.005), combined=(1.02, 0.004))[0].route == "combined"
-    assert pick(free=(1.0, 0.005), parametric=(1.3, 0.001))[0].route == "free"
-    assert pick(mixed=(1.4, 0.002), parametric=(1.3, 0.003))[0].route == "mixed"
-    assert pick(mixed=(9.0, 0.002), free=(2.5, 0.003))[0].route == "free"
-    assert pick(mixed=(1.24, 0.002))[1].startswith(
-        "calibration good: residual 1.24 x noise variance (limit 1.5)"
-    )
-    doubtful = pick(mixed=(8.0, 0.002))[1]
-    assert doubtful.startswith("calibration doubtful: residual 8.00 x")
+    assert pick(free=(1.0, 0.005), parametric=(1.1, 0.001)) == "parametric"
+    assert pick(free=(1.0, 0.005), combined=(1.02, 0.004)) == "combined"
+    assert pick(free=(1.0, 0.005), parametric=(1.3, 0.001)) == "free"
+    assert pick(mixed=(1.4, 0.002), parametric=(1.3, 0.003)) == "mixed"
+    assert pick(mixed=(9.0, 0.002), free=(2.5, 0.003)) == "free"
+
+
+@pytest.mark.parametrize(
+    ("chi2", "error", "said"),
+    [(1.24, 0.002, "good"), (1.24, 0.06, "imprecise"), (8.0, 0.002, "doubtful")],
+)
+def test_a_calibration_is_called_good_by_its_residual_and_its_stated_error(chi2, error, said):
+    words = explain(HeldOut("mixed", chi2, 0.0, np.ones((4, 4), np.float32)), error)
+    assert words.startswith(f"calibration {said}: residual {chi2:.2f} x noise variance (limit 1.5)")
+    assert f"error stated {100 * error:.2f}%" in words
 
 
 def test_dark_current_is_drawn_as_a_line_between_two_dark_exposures(few):

@@ -163,6 +163,8 @@ def test_wrong_usage_of_every_command_is_a_line_and_code_2(run):
         code, _, err = run(*words, "nosuch")
         assert (code, "no such command 'nosuch'" in err) == (2, True), err
         _wrong(words, err)
+    said = run("dem")[2]
+    assert said.endswith("'dem'. Did you mean 'demo'? `emmc-rig -h` shows what it takes\n"), said
     for words, command in every.items():
         for option in [known for known in command.params if not getattr(known, "is_flag", True)][
             :1

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -224,7 +225,7 @@ class Bench:
         drawn = [part.tobytes() for part in (*self.masks, self.astray)]
         self.known = TRACED.setdefault((repr(traced), self.size, sensor.bayer, *drawn), {})
 
-    @property
+    @cached_property
     def colour(self) -> Array:
         """The colour that every pixel sees, (y, x): 0 red, 1 green, 2 blue, of RGGB."""
         rows, columns = np.indices(self.size) % 2
@@ -426,15 +427,13 @@ class Bench:
         y, x = (optics.rim_shift * place for place in self._pixels())
         beside = (np.arange(points) + 0.5) / points - 0.5
         inside, from_v, from_u = np.zeros((3, *self.size))
+        right = (piece.sides_um[1] * beside)[:, None, None]
         for down in piece.sides_um[0] * beside:
-            for right in piece.sides_um[1] * beside:
-                away = (piece.at_um[0] + down - y) ** 2 + (piece.at_um[1] + right - x) ** 2
-                within = away < (optics.rim_um / 2) ** 2
-                inside, from_v, from_u = (
-                    inside + within,
-                    from_v + down * within,
-                    from_u + right * within,
-                )
+            away = (piece.at_um[0] + down - y) ** 2 + (piece.at_um[1] + right - x) ** 2
+            within = away < (optics.rim_um / 2) ** 2
+            inside += within.sum(axis=0)
+            from_v += down * within.sum(axis=0)
+            from_u += (right * within).sum(axis=0)
         seen = np.maximum(inside, 1)
         at_um = piece.at_um[0] + from_v / seen, piece.at_um[1] + from_u / seen
         return piece._replace(at_um=at_um), inside / points**2
@@ -563,16 +562,16 @@ class Bench:
         for at_v in [piece.at_um[0] + side for side in sides[0] * beside]:
             for at_u in [piece.at_um[1] + side for side in sides[1] * beside]:
                 for dy in within:
-                    for dx in within:
-                        ray = x + dx, y + dy, at_u, at_v
-                        row, column = self._met(*ray, piece.cell, (mask_x, mask_y), now)
-                        through = self._box(0, row, column, sides, now, colour)
-                        if two:
-                            far = now.behind_um / now.lens_um
-                            row = (1 - far) * (y + dy) + far * at_v
-                            column = (1 - far) * (x + dx) + far * at_u
-                            through = through * self._box(1, row, column, sides, now, colour)
-                        passed += through
+                    # All rays of a row of a pixel's points at once, (point, y, x).
+                    ray = x + within[:, None, None], y + dy, at_u, at_v
+                    row, column = self._met(*ray, piece.cell, (mask_x, mask_y), now)
+                    through = self._box(0, row, column, sides, now, colour)
+                    if two:
+                        far = now.behind_um / now.lens_um
+                        row = (1 - far) * (y + dy) + far * at_v + 0 * column
+                        column = (1 - far) * ray[0] + far * at_u
+                        through = through * self._box(1, row, column, sides, now, colour)
+                    passed += through.sum(axis=0)
         return passed / (points * parts) ** 2
 
     def _met(

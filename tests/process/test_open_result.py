@@ -94,6 +94,8 @@ def test_open_frames_opens_those_of_a_result(result, saved):
     psi, frames = emmc.open_frames(saved)
     np.testing.assert_array_equal(frames.readings, result.frames.readings)
     assert psi.checksum() == result.psi.checksum()
+    with pytest.raises(AppError, match=r"^nowhere: no such folder; name a session"):
+        emmc.open_frames("nowhere")
 
 
 def test_metrics_say_what_made_them(result, frames, tmp_path):
