@@ -86,7 +86,7 @@ def store(name: str, rows: Iterable[dict] | pd.DataFrame, command: str) -> None:
 
 def chart(name: str) -> None:
     """Every method on crops of a group, and the plug-ins of the lab where they are installed."""
-    asked = "--size", "64x80", "--camera", ONE_SHOT, "--camera", THREE_SHOTS
+    asked = "--size", "64x80", "--camera", ONE_SHOT, "--camera", THREE_SHOTS, "--repeats", "3"
     out = program("chart", *asked, *scenes(name.split("-")[2].upper()))
     store(name, pd.read_csv(out / "chart.csv"), f"emmc-rig chart {' '.join(asked)} --scene ...")
 

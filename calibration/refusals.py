@@ -120,9 +120,17 @@ def _refuse_saturated(boards: BoardSet) -> None:
     if not gains:
         return
     typical = float(np.median(list(gains.values())))
-    for name, frame in lit():
+    for number, (name, frame) in enumerate(lit()):
         less = gains.get(name, typical) < LEAST_GAIN_SHARE * typical
-        if less or _plateau(_above_dn(frame, boards), typical, frame.count) > PLATEAU_SHARE:
+        flat = _plateau(_above_dn(frame, boards), typical, frame.count) > PLATEAU_SHARE
+        if less and not flat and number < len(boards.references):
+            raise CalibrationError(
+                f"{name}: of the same light it has less than half the noise of frames with the "
+                "mask in: the mask moves from frame to frame, or this one is saturated below the "
+                "white level; fasten the mask and let the bench settle, or shorten the exposure "
+                f"({frame.exposure_s:g} s)"
+            )
+        if less or flat:
             raise CalibrationError(
                 f"{name}: saturated below the white level, its brightest pixels have less noise "
                 f"than their light makes; shorten the exposure ({frame.exposure_s:g} s) or dim the "
@@ -199,9 +207,10 @@ def refuse_another_mask(boards: Iterable[Board], camera: Camera, mask: ShadowMas
             _raise_dim_references(float(np.mean(clearest)))
         means = np.mean(others, axis=0)
         if means.max() > np.mean(own) + MIRRORED:
+            order = list(ORIENTATIONS)[int(np.argmax(means))]
             raise CalibrationError(
                 "the views are not those that the whiteboards are named for: they are "
-                f"{list(ORIENTATIONS)[int(np.argmax(means))]}; check the axes of the aperture's stage"
+                f"{order}; check the axes of the aperture's stage"
             )
     return shadow.placement
 

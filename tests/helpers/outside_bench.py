@@ -568,7 +568,7 @@ class Bench:
                     through = self._box(0, row, column, sides, now, colour)
                     if two:
                         far = now.behind_um / now.lens_um
-                        row = (1 - far) * (y + dy) + far * at_v + 0 * column
+                        row = (1 - far) * (y + dy) + far * at_v
                         column = (1 - far) * ray[0] + far * at_u
                         through = through * self._box(1, row, column, sides, now, colour)
                     passed += through.sum(axis=0)
