@@ -167,7 +167,7 @@ def speed() -> Section:
         f"`adaptive-fast` is {best[1] - fast[1]:.1f} dB below `adaptive`, in "
         f"{percent(fast[0] / best[0])} of the time.",
         f"Up is better, left is faster. Each point is the mean of {len(scenes)} light fields of "
-        "group B, cropped to 64x80; time is on one core.",
+        "group B, cropped to 64x80. Times are CPU seconds.",
         ("chart-group-b-64x80", "chart-group-a-64x80"),
         {"speed": svg_charts.points(answer, ("processor seconds", "PSNR, dB"), named)},
         table,
