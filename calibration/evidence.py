@@ -123,8 +123,9 @@ def _block_covariances(coefficients, down, across, grids):
     n = shots * area
     fine, coarse = grids[0, 1] ** 2, grids[1, 1] ** 2
     total = fine + coarse + 1
+    # Loops, where expressions of arrays would do: these compile in four times the time.
     matrix = np.zeros((n, total))
-    chroma = np.zeros((n, n))
+    coloured = np.empty((n, stored * (total - fine)))
     for c in range(stored):
         own = np.zeros((n, total))
         at = 0
@@ -132,13 +133,16 @@ def _block_covariances(coefficients, down, across, grids):
             first, count = grids[grid, 0], grids[grid, 1]
             _add_grid(coefficients[c], down, across, first, count, own, at)
             at += count**2
-        matrix += own
-        coloured = own[:, fine:] * CHROMA_SPREAD
-        chroma += coloured @ coloured.T
-    matrix[:, :fine] *= FINE_SPREAD
-    matrix[:, fine : fine + coarse] *= COARSE_SPREAD
-    matrix[:, fine + coarse :] *= MEAN_SPREAD
-    return matrix @ matrix.T, chroma
+        for i in range(n):
+            for k in range(total):
+                matrix[i, k] += own[i, k]
+            for k in range(fine, total):
+                coloured[i, c * (total - fine) + k - fine] = own[i, k] * CHROMA_SPREAD
+    for i in range(n):
+        for k in range(total):
+            spread = FINE_SPREAD if k < fine else COARSE_SPREAD
+            matrix[i, k] *= spread if k < fine + coarse else MEAN_SPREAD
+    return matrix @ matrix.T, coloured @ coloured.T
 
 
 @njit(forceinline=True)
@@ -166,16 +170,13 @@ def _compute_evidence(coefficients, colours, readings, noise, down, across, grid
             + scale (FLOOR_SHARE^2 + noise / level^2) on the diagonal
 
     scale: mean variance by brightness; level: the block's mean reading. coefficients: (block,
-    stored, shot, pixel, v, u); colours, readings, noise: (block, shot, pixel). chosen: (block,
+    stored, shot, pixel, v, u); colours, readings, noise: (block, shot x pixel). chosen: (block,
     candidate), indices of disparities.
     """
     stored = coefficients.shape[1]
-    blocks, shots, area = readings.shape
-    n = shots * area
+    blocks, n = readings.shape
     for block in prange(blocks):
-        values = readings[block].copy().reshape(n)
-        variances = noise[block].copy().reshape(n)
-        colour = colours[block].copy().reshape(n)
+        values, variances, colour = readings[block], noise[block], colours[block]
         level = 0.0
         for i in range(n):
             level += values[i] / n
@@ -210,11 +211,12 @@ def log_evidence(
     a reading. chosen: (block, candidate), indices into the prior's disparities.
     """
     found = np.empty(chosen.shape)
+    flat = len(found), int(np.prod(readings.shape[1:]))
     _compute_evidence(
         np.ascontiguousarray(coefficients, dtype=np.float64),
-        np.ascontiguousarray(colours),
-        np.ascontiguousarray(readings, dtype=np.float64),
-        np.ascontiguousarray(noise, dtype=np.float64),
+        np.ascontiguousarray(colours).reshape(flat),
+        np.ascontiguousarray(readings, dtype=np.float64).reshape(flat),
+        np.ascontiguousarray(noise, dtype=np.float64).reshape(flat),
         prior.down,
         prior.across,
         prior.grids,
