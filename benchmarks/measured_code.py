@@ -84,6 +84,8 @@ def _without_words(source: str) -> str:
     """Return the syntax tree of a module without strings alone on a line and what users read."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "cost_words":
+            node.args = []  # the chart's own seconds
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             node.exc = node.exc.func  # an error that is raised ends a measurement, whatever it says
         if isinstance(node, ast.JoinedStr) and any(map(_is_words, node.values)):

@@ -12,7 +12,7 @@ import results_page
 from emmc_rig.study.design.bench import load_bench
 
 BEFORE = '"""Words."""\n\nLIMIT = 3\n"""Of what."""\nif not LIMIT:\n    raise ValueError("no")\n'
-BEFORE += 'NAME = "tv"\nprint(f"no limit: {LIMIT}")\n'
+BEFORE += 'NAME = "tv"\nprint(f"no limit: {LIMIT}")\nCOST = cost_words(1.4, 6.8)\n'
 
 
 @pytest.fixture
@@ -38,6 +38,7 @@ def commit(tmp_path, monkeypatch):
         ("one.py", BEFORE.replace("\n\nLIMIT", "\n\n# Three.\nLIMIT"), ()),
         ("one.py", BEFORE.replace('"no"', 'f"no {LIMIT}: raise it"'), ()),
         ("one.py", BEFORE.replace("no limit: {LIMIT}", "{LIMIT} is no limit"), ()),
+        ("one.py", BEFORE.replace("1.4, 6.8", "0.48, 1.2"), ()),
         ("one.py", BEFORE.replace("{LIMIT}", "{-LIMIT}"), ("room/one.py",)),
         ("one.py", BEFORE.replace("tv", "adaptive"), ("room/one.py",)),
         ("one.py", BEFORE.replace("ValueError", "KeyError"), ("room/one.py",)),

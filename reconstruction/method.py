@@ -155,7 +155,7 @@ class Method:
 def cost_words(one_shot_s: float, three_shots_s: float) -> str:
     """Return what a method costs, in words, by its seconds on 5x5 views of 64x80 pixels.
 
-    The shipped methods state the medians over seven real scenes and one core in
+    The shipped methods state the medians over seven real scenes on two cores in
     docs/results/chart-group-a-64x80.csv, which `emmc-rig chart --size 64x80` measures.
     """
     return f"about {one_shot_s:g} s for 64x80 pixels from one shot, {three_shots_s:g} s from three"

@@ -86,7 +86,7 @@ METHODS = (
         "deepinv-pnp",
         "deepinv's plug-and-play with total variation of epipolar images",
         "smooth areas with sharp edges, small disparities",
-        "about 11 CPU s for 64x80 pixels from one shot",
+        "about 9 CPU s for 64x80 pixels from one shot",
         "to compare with another library; needs deepinv",
         _solve,
         "deepinv_pnp",

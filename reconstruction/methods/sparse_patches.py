@@ -23,7 +23,7 @@ METHODS = (
         "dict-admm",
         "sparse patches by ADMM with working sets (the paper's Dict-ADMM)",
         "every patch is a sum of a few atoms of the dictionary",
-        cost_words(1.4, 4.3),
+        cost_words(0.59, 1.9),
         "one shot with a dictionary of similar scenes",
         _solve,
         "sparse",

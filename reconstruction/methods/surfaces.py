@@ -120,7 +120,7 @@ METHODS = (
         "from two shots on",
         "the scene consists of opaque surfaces that look the same from all views; from two shots "
         "on, that or what `tv-dict` assumes, each where it holds",
-        cost_words(1.4, 6.8),
+        cost_words(0.48, 1.2),
         "any scene and number of shots; gives disparity and standard deviation; the default",
         partial(_solve, "adaptive", lambda settings: settings),
         "adaptive",
@@ -134,7 +134,7 @@ METHODS = (
         "adaptive-fast",
         "as adaptive, with fewer patches, disparities and steps",
         "as adaptive",
-        cost_words(0.63, 1.3),
+        cost_words(0.26, 0.53),
         "previews; from one shot still more accurate than tv",
         partial(_solve, "adaptive-fast", fast),
         "adaptive",

@@ -63,7 +63,7 @@ METHODS = (
         "unrolled",
         "a learned denoiser between exact data steps, Psi as an input",
         "scenes like the random worlds of its training, of the views that it was trained for",
-        cost_words(0.34, 0.41),
+        cost_words(0.14, 0.17),
         "to compare what learning buys; needs PyTorch",
         _solve,
         "unrolled",
