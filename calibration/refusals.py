@@ -125,10 +125,10 @@ def _refuse_saturated(boards: BoardSet) -> None:
         flat = _plateau(_above_dn(frame, boards), typical, frame.count) > PLATEAU_SHARE
         if less and not flat and number < len(boards.references):
             raise CalibrationError(
-                f"{name}: of the same light it has less than half the noise of frames with the "
-                "mask in: the mask moves from frame to frame, or this one is saturated below the "
-                "white level; fasten the mask and let the bench settle, or shorten the exposure "
-                f"({frame.exposure_s:g} s)"
+                f"{name}: saturated below the white level, or the mask moves from frame to frame: "
+                "this one has less than half the noise of frames with the mask in, of the same "
+                f"light; shorten the exposure ({frame.exposure_s:g} s) or dim the lamp, or fasten "
+                "the mask and let the bench settle"
             )
         if less or flat:
             raise CalibrationError(

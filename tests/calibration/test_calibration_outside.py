@@ -291,7 +291,7 @@ def test_a_response_that_is_not_linear_is_named_and_counted():
     [
         ({"beside": ((1, 1), (1, 2))}, r"shows the shadow through the hole of view \(1, 2\)"),
         ({"creep_um": 0.1}, "the mask drifts: by"),
-        ({"creep_um": 0.3}, "the mask moves from frame to frame, or"),
+        ({"creep_um": 0.3}, "or the mask moves from frame to frame: "),
     ],
 )
 def test_a_hole_beside_and_a_mask_that_drifts_are_refused_by_name(course, words):
