@@ -143,7 +143,7 @@ RUNS = (
     Run("chart-group-b-64x80", chart),
     Run("growth", "benchmarks/growth.py --largest 512"),
     Run("films", "benchmarks/films.py --group B"),
-    Run("shots", "benchmarks/trends.py --name shots --group AB --shots 1 --shots 3 --shots 6 "
+    Run("shots", "benchmarks/trends.py --name shots --group B --shots 1 --shots 3 --shots 6 "
         "--noise 0.002 --size 256x256 --method adaptive --method adaptive-fast --method tv "
         "--method tv-dict"),
     Run("moving-shots", "benchmarks/moving_shots.py --group B", alone=False),
@@ -159,6 +159,9 @@ RUNS = (
     Run("stability-real", stability, alone=False),
     Run("stability-real-breaking", stability, alone=False),
     Run("design", design, alone=False),
+    Run("constants", "benchmarks/constants.py --group A --size 64x64", alone=False),
+    Run("worst", "benchmarks/worst.py", alone=False),
+    Run("crops", "benchmarks/crops.py --group AB"),
     Run("calibration_checks", "benchmarks/calibration_checks.py psi hands few effects session cost "
         "drift streamed"),
     Run("large", large),

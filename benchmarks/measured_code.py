@@ -53,8 +53,8 @@ def commit_of_code(rooms: Iterable[str] = CALIBRATING) -> str:
 
     Returns "" without git.
     """
-    found = _git("rev-parse", "--short=10", "HEAD").strip()
-    changed = _git("status", "--porcelain", "--", *rooms)
+    found = git("rev-parse", "--short=10", "HEAD").strip()
+    changed = git("status", "--porcelain", "--", *rooms)
     return f"{found}+" if found and changed else found
 
 
@@ -65,15 +65,15 @@ def changed_since(commit: str, rooms: tuple[str, ...] = FITTING) -> tuple[str, .
     Comments, docstrings, layout, what errors say and texts of several words do not count. For an
     unknown commit, or a commit with a +, all rooms are returned.
     """
-    if not commit or commit.endswith("+") or not _git("cat-file", "-t", commit):
+    if not commit or commit.endswith("+") or not git("cat-file", "-t", commit):
         return rooms
-    files = _git("diff", "--name-only", "--no-renames", commit, "--", *rooms).splitlines()
+    files = git("diff", "--name-only", "--no-renames", commit, "--", *rooms).splitlines()
     return tuple(name for name in files if _differs(name, commit))
 
 
 def _differs(name: str, commit: str) -> bool:
     path = ROOT / name
-    before = _git("show", f"{commit}:{name}")
+    before = git("show", f"{commit}:{name}")
     now = path.read_text(encoding="utf-8") if path.is_file() else ""
     if path.suffix == ".py" and before and now:
         return _without_words(before) != _without_words(now)
@@ -110,7 +110,7 @@ def _is_words(node: ast.AST) -> bool:
     return _is_str(node) and " " in ast.literal_eval(node)
 
 
-def _git(*words: str) -> str:
+def git(*words: str) -> str:
     """Return what a git command prints; "" where it fails."""
     asked = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
     return asked.stdout if asked.returncode == 0 else ""

@@ -1,58 +1,94 @@
-"""Training of dictionaries: resumed as undisturbed, refused where a file is in the way, drawn."""
+"""Training of dictionaries: planted atoms found, patches cut, files in the way refused, drawn."""
+
+import sys
 
 import numpy as np
 import pytest
-import train_dictionary
-from learning import LearningSettings
-from train_dictionary import draw_atoms, train
-from training_patches import PatchSettings
+from train_dictionary import draw_atoms, flat_atoms, learn_ksvd, main
+from training_patches import cut_patches
 
 from emmc_rig.errors import AppError
 from emmc_rig.model.lightfield import save_hdf5
 from emmc_rig.reconstruction.dictionary import Dictionary
 
-PATCHING = PatchSettings(rows=4, columns=4, count=120)
-LEARNING = LearningSettings(atoms=24, sparsity=3, iterations=3)
-
 
 @pytest.fixture
-def scenes(tmp_path):
-    """Files of two light fields."""
+def train(tmp_path, monkeypatch):
+    """Return a function that trains on two small scenes as the command line would."""
     rng = np.random.default_rng(0)
-    for name in ("cat", "dog"):
-        save_hdf5(tmp_path / f"{name}.h5", rng.random((2, 2, 20, 24, 3), dtype=np.float32), {})
-    return [str(tmp_path / f"{name}.h5") for name in ("cat", "dog")]
+    sizes = {"--patch": "4x4", "--patches": "120", "--atoms": "24", "--sparsity": "3"}
+    typed = [word for option in sizes.items() for word in option]
+    for name, views in (("cat", 2), ("dog", 2), ("owl", 3)):
+        scene = rng.random((views, views, 20, 24, 3), dtype=np.float32)
+        save_hdf5(tmp_path / f"{name}.h5", scene, {})
+
+    def trained(out, *more, scenes=("cat", "dog")):
+        given = [word for name in scenes for word in ("--scene", str(tmp_path / f"{name}.h5"))]
+        monkeypatch.setattr(sys, "argv", ["train", *typed, *given, *more, "--out", str(out)])
+        main()
+        return Dictionary.load(out)
+
+    return trained
 
 
-def test_a_stopped_training_goes_on_to_the_undisturbed_atoms(scenes, tmp_path, monkeypatch):
-    whole = train(tmp_path / "whole.h5", scenes, PATCHING, LEARNING)
-    assert Dictionary.load(tmp_path / "whole.h5").size == 24
-    assert '"cat"' in whole.provenance
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    # The first step is kept, and then the training stops.
-    monkeypatch.setattr(train_dictionary, "CHECKPOINT_INTERVAL_S", -1.0)
-    with monkeypatch.context() as patch:
-        save = train_dictionary.save_checkpoint
-        patch.setattr(train_dictionary, "save_checkpoint", lambda *given: (save(*given), stop()))
-        with pytest.raises(KeyboardInterrupt):
-            train(tmp_path / "parts.h5", scenes, PATCHING, LEARNING)
-    assert (tmp_path / "parts.checkpoint.npz").exists()
-    with pytest.raises(AppError, match="other patches or settings"):
-        train(tmp_path / "parts.h5", scenes[:1], PATCHING, LEARNING)
-    parts = train(tmp_path / "parts.h5", scenes, PATCHING, LEARNING)
-    np.testing.assert_array_equal(parts.atoms, whole.atoms)
-    assert not (tmp_path / "parts.checkpoint.npz").exists()
+def test_a_dictionary_holds_flat_colours_and_atoms_of_its_scenes_by_the_seed(train, tmp_path):
+    first, same, other = (
+        train(tmp_path / f"{name}.h5", "--seed", seed)
+        for name, seed in (("first", "1"), ("same", "1"), ("other", "2"))
+    )
+    assert first.size == 24
+    assert '"cat"' in first.provenance
+    np.testing.assert_array_equal(first.atoms, same.atoms)
+    assert (first.atoms != other.atoms).any()
+    rows = first.atoms.reshape(24, -1)
+    np.testing.assert_allclose(rows[:3], flat_atoms(first.patch_shape), atol=1e-6)
+    np.testing.assert_allclose(rows[3:] @ rows[:3].T, 0, atol=1e-5)
 
 
-def test_a_file_in_the_way_is_refused_before_the_training(scenes, tmp_path):
-    (tmp_path / "d.png").write_bytes(b"mine")
-    with pytest.raises(AppError, match="exists already"):
-        train(tmp_path / "d.h5", scenes, PATCHING, LEARNING)
-    with pytest.raises(AppError, match=r"ends in \.h5"):
-        train(tmp_path / "d.txt", scenes, PATCHING, LEARNING)
+def test_planted_atoms_are_recovered():
+    rng = np.random.default_rng(0)
+    truth = rng.standard_normal((40, 50)).astype(np.float32)
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    codes = np.zeros((2000, 40), np.float32)
+    for code in codes:
+        code[rng.choice(40, 3, replace=False)] = rng.standard_normal(3)
+    errors = []
+    found = learn_ksvd(codes @ truth, 40, 3, 40, rng, lambda step, error: errors.append(error))
+    assert len(errors) == 40
+    assert errors[-1] < 0.4 * errors[0]
+    assert np.mean(np.abs(found @ truth.T).max(axis=0) > 0.99) > 0.8
+
+
+@pytest.mark.parametrize("symmetry", range(8))
+def test_a_symmetry_keeps_a_plane_a_plane_of_the_same_disparity(symmetry):
+    texture = np.random.default_rng(0).random((20, 20)).astype(np.float32)
+    lf = np.empty((3, 3, 12, 12, 1), np.float32)
+    for v, u in np.ndindex(3, 3):
+        lf[v, u, ..., 0] = texture[5 - v : 17 - v, 5 - u : 17 - u]
+    patch = cut_patches(lf, np.array([[3, 3]]), np.array([symmetry]), (5, 5))[0]
+    np.testing.assert_array_equal(patch[2, 2, 1:, 1:], patch[1, 1, :-1, :-1])
+    rows = lf[1, 1, 3:8, 3:8]
+    rows = rows[:, ::-1] if symmetry & 1 else rows
+    rows = rows[::-1] if symmetry & 2 else rows
+    rows = rows.transpose(1, 0, 2) if symmetry & 4 else rows
+    np.testing.assert_array_equal(patch[1, 1], rows)
+
+
+@pytest.mark.parametrize(
+    ("out", "more", "scenes", "says"),
+    [
+        ("mine.h5", (), ("cat",), "exists already"),
+        ("mine.txt", (), ("cat",), r"ends in \.h5"),
+        ("d.h5", (), ("cat", "owl"), "3x3 views, .*cat.h5 has 2x2"),
+        ("d.h5", ("--patch", "24x24"), ("cat",), "smaller than a patch of 24x24"),
+        ("d.h5", ("--patches", "20"), ("cat",), "20 patches are not flat, too few for 24"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(train, tmp_path, out, more, scenes, says):
+    (tmp_path / "mine.png").write_bytes(b"mine")
+    with pytest.raises(AppError, match=says):
+        train(tmp_path / out, *more, scenes=scenes)
+    assert not (tmp_path / out).exists()
 
 
 def test_the_picture_shows_centre_view_and_epi_of_every_atom():

@@ -3,34 +3,36 @@
     python benchmarks/train_dictionary.py --scene SCENES/knights --scene near-planar --out mine.h5
 
 A scene is a folder of view_ROW_COL.png, an HDF5 light field or the name of a built-in one. Beside
-the dictionary lies a picture of its atoms. Ctrl-C leaves a checkpoint; the same line goes on.
+the dictionary lies a picture of its atoms. The first atoms are flat, one for each opponent colour;
+the others are learned from patches less their flat share (Aharon, Elad, Bruckstein 2006, "K-SVD: an
+algorithm for designing overcomplete dictionaries for sparse representation"). Sparse codes are
+those of scikit-learn.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
-import time
-from dataclasses import asdict
+import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
-from learning import Iteration, LearningSettings, LearningState, learn_ksvd
 from numpy.typing import NDArray
-from training_patches import PatchSettings, training_patches
+from sklearn.decomposition import sparse_encode
+from training_patches import Array, drawn_patches
 
 from emmc_rig.errors import ERRORS, AppError
 from emmc_rig.formats.scenes import open_scene
-from emmc_rig.model.files import whole_file
+from emmc_rig.model.lightfield import OPPONENT
 from emmc_rig.reconstruction.dictionary import Dictionary
 from emmc_rig.store.folders import new_file
 from emmc_rig.store.results import command_line, parse_size, versions
 
-CHECKPOINT_INTERVAL_S = 60.0
 SHOWN_ATOMS, ZOOM, GAP_PX = 400, 3, 2
+LEAST_CONTRAST = 1e-3
+"""Of a patch that is learned from, in deviations of readings: flat patches teach nothing."""
 
 
 def main() -> None:
@@ -51,93 +53,111 @@ def main() -> None:
         options.atoms, options.sparsity, options.iterations = 24, 3, 2
     if not options.scene:
         parser.error("--scene is needed, once for each scene")
-    size = parse_size(options.patch, "--patch", "9x9") or (9, 9)
-    learning = LearningSettings(
-        atoms=options.atoms, sparsity=options.sparsity, iterations=options.iterations,
-        seed=options.seed,
-    )  # fmt: skip
-    patches = PatchSettings(rows=size[0], columns=size[1], count=options.patches, seed=options.seed)
-    dictionary = train(options.out, options.scene, patches, learning)
-    print(f"wrote {options.out}: {dictionary.size} atoms of {len(options.scene)} scene(s)")
+    train(options)
 
 
-def train(
-    out: Path, scenes: list[str], patching: PatchSettings, learning: LearningSettings
-) -> Dictionary:
-    """Write a dictionary learned from scenes to `out`, and the picture of its atoms beside it."""
-    picture, kept = out.with_suffix(".png"), out.with_suffix(".checkpoint.npz")
+def train(options: argparse.Namespace) -> None:
+    """Write a dictionary learned from scenes, and the picture of its atoms beside it.
+
+    options: those of the command line. Raises AppError for files in the way and scenes that
+    cannot be learned from.
+    """
+    out, picture = options.out, options.out.with_suffix(".png")
     if out.suffix not in (".h5", ".hdf5"):
         raise AppError(f"--out {out}: a dictionary's file ends in .h5")
     for path in (out, picture):
         if path.exists():
             raise AppError(f"{path}: exists already; choose another name")
-    patches = training_patches(
-        [lambda spec=spec: open_scene(spec).light_field for spec in scenes],
-        patching,
-        lambda number: print(f"read {scenes[number]}"),
-    )
-    shape, rows = patches.shape[1:], patches.reshape(len(patches), -1)
-    recipe = json.dumps(
-        {
-            "kind": "ksvd",
-            "scenes": sorted({Path(spec).stem for spec in scenes}),
-            "patches": patching.model_dump(),
-            "settings": learning.model_dump(exclude={"iterations"}),
-            "data": hashlib.blake2b(np.ascontiguousarray(rows).data, digest_size=16).hexdigest(),
-        }
-    )
-    start = load_checkpoint(kept, recipe) if kept.exists() else None
-    steps, saved_at = [start] if start else [], time.perf_counter()
-
-    def on_step(state: LearningState) -> None:
-        nonlocal saved_at
-        steps[:] = [state]
-        done = state.history[-1]
-        print(f"step {done.step} of {learning.iterations}: error {done.updated_rmse:.5f}")
-        if time.perf_counter() - saved_at > CHECKPOINT_INTERVAL_S:
-            save_checkpoint(kept, recipe, state)
-            saved_at = time.perf_counter()
-
-    try:
-        state = learn_ksvd(rows, shape, learning, start, on_step)
-    except KeyboardInterrupt:
-        if steps:
-            save_checkpoint(kept, recipe, steps[0])
-        sys.exit(f"stopped by Ctrl-C; the same command goes on from {kept}")
+    size = parse_size(options.patch, "--patch", "9x9") or (9, 9)
+    rng = np.random.default_rng(options.seed)
+    patches = patches_of(options.scene, -(-options.patches // len(options.scene)), size, rng)
+    flat = flat_atoms(patches.shape[1:])
+    rows = patches.reshape(len(patches), -1)
+    rows = rows - (rows @ flat.T) @ flat
+    rows = rows[rows.std(axis=1) > LEAST_CONTRAST]
+    if len(rows) < options.atoms:
+        raise AppError(
+            f"{len(rows)} patches are not flat, too few for {options.atoms} atoms: give --patches "
+            "more, or --atoms less"
+        )
+    learned = learn_ksvd(
+        rows, options.atoms - len(flat), options.sparsity, options.iterations, rng,
+        lambda step, error: print(f"step {step} of {options.iterations}: error {error:.5f}"),
+    )  # fmt: skip
     provenance = {
-        **json.loads(recipe),
-        "sources": scenes,
-        "settings": learning.model_dump(),
-        "history": [asdict(done) for done in state.history],
+        "scenes": sorted({Path(spec).stem for spec in options.scene}),
         "command": command_line(),
         "versions": versions(),
     }
-    atoms = state.atoms.reshape(-1, *shape)
+    atoms = np.concatenate([flat, learned]).reshape(-1, *patches.shape[1:])
     dictionary = Dictionary.normalised(atoms, "ksvd", json.dumps(provenance, indent=1))
     with new_file(out) as written, new_file(picture) as drawn:
         dictionary.save(written)
         cv2.imwrite(str(drawn), draw_atoms(dictionary))
-    kept.unlink(missing_ok=True)
-    return dictionary
+    print(f"wrote {out}: {dictionary.size} atoms of {len(options.scene)} scene(s)")
 
 
-def save_checkpoint(path: Path, recipe: str, state: LearningState) -> None:
-    """Write a state of the training that a recipe describes."""
-    history = json.dumps([asdict(done) for done in state.history])
-    with whole_file(path) as partial, open(partial, "wb") as file:
-        np.savez(
-            file, recipe=recipe, history=history, atoms=state.atoms, indices=state.indices,
-            coefficients=state.coefficients,
-        )  # fmt: skip
+def patches_of(
+    specs: list[str], count: int, size: tuple[int, int], rng: np.random.Generator
+) -> Array:
+    """Return `count` patches (patch, v, u, y, x, c) of every scene.
+
+    Raises AppError for scenes of other views than the first, or smaller than a patch.
+    """
+    found: list[Array] = []
+    for spec in specs:
+        light_field = open_scene(spec).light_field
+        if min(np.subtract(light_field.shape[2:4], size)) < 0:
+            raise AppError(f"scene {spec}: smaller than a patch of {size[0]}x{size[1]} pixels")
+        views = light_field.shape[:2]
+        if found and views != found[0].shape[1:3]:
+            raise AppError(
+                f"scene {spec}: has {views[0]}x{views[1]} views, {specs[0]} has "
+                f"{found[0].shape[1]}x{found[0].shape[2]}; train on scenes of the same views"
+            )
+        found.append(drawn_patches(light_field, count, size, rng))
+        print(f"read {spec}")
+    return np.concatenate(found)
 
 
-def load_checkpoint(path: Path, recipe: str) -> LearningState:
-    """Return the state that `save_checkpoint` wrote; raises AppError for another training's."""
-    with np.load(path) as kept:
-        if str(kept["recipe"]) != recipe:
-            raise AppError(f"{path}: of a training of other patches or settings; delete it")
-        history = tuple(Iteration(**done) for done in json.loads(str(kept["history"])))
-        return LearningState(kept["atoms"], kept["indices"], kept["coefficients"], history)
+def flat_atoms(patch_shape: tuple[int, ...]) -> Array:
+    """Return constant atoms (colour, sample), one for each opponent colour, of unit norm."""
+    samples = int(np.prod(patch_shape[:-1]))
+    return np.tile(OPPONENT, samples).astype(np.float32) / np.float32(np.sqrt(samples))
+
+
+def learn_ksvd(rows: Array, atoms: int, sparsity: int, iterations: int, rng, on_step) -> Array:
+    """Return atoms (atom, sample) of unit norm, learned from patches (patch, sample).
+
+    A step codes every patch by `sparsity` atoms at most, fewer where they explain it. Then a power
+    iteration improves each atom, with its weights, on the patches coded by it (Rubinstein,
+    Zibulevsky, Elad 2008). An atom without patches becomes the residual of the worst patch.
+
+    on_step: called with the number of each step and the RMS error of a sample after it.
+    """
+    found = rows[rng.choice(len(rows), atoms, replace=False)]
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    for step in range(1, iterations + 1):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Orthogonal matching pursuit ended prematurely")
+            codes = sparse_encode(rows, found, algorithm="omp", n_nonzero_coefs=sparsity)
+        codes = codes.astype(np.float32)
+        left = rows - codes @ found
+        for atom in range(atoms):
+            users = np.flatnonzero(codes[:, atom])
+            if not users.size:
+                worst = np.einsum("ij,ij->i", left, left).argmax()
+                if length := np.linalg.norm(left[worst]):
+                    found[atom] = left[worst] / length
+                    left[worst] = 0
+                continue
+            own = left[users] + np.outer(codes[users, atom], found[atom])
+            towards = codes[users, atom] @ own
+            found[atom] = towards / np.linalg.norm(towards)
+            codes[users, atom] = own @ found[atom]
+            left[users] = own - np.outer(codes[users, atom], found[atom])
+        on_step(step, float(np.sqrt(np.mean(np.square(left)))))
+    return found
 
 
 def draw_atoms(dictionary: Dictionary) -> NDArray[np.uint8]:
