@@ -92,13 +92,15 @@ def points(args, choices: Iterable[Mapping]) -> list[dict]:
 def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, args) -> pd.DataFrame:
     """Return a row for each point: the point's values, those of `measure(**point)`, the commit.
 
-    NAME.csv keeps each finished row. A later run skips a row if the code that it depends on is
-    still the same, and measures it again otherwise. The run's command and date go into RUNS.
+    NAME.unfinished.csv keeps each row, and becomes NAME.csv with the last. A later run skips a row
+    if the code that it depends on is still the same, and measures it again otherwise. The run's
+    command and date go into RUNS.
     """
     points = list(points)
     args.out.mkdir(parents=True, exist_ok=True)
-    path = args.out / f"{name}.csv"
-    kept = pd.read_csv(path, dtype=str) if path.is_file() else pd.DataFrame()
+    path, unfinished = args.out / f"{name}.csv", args.out / f"{name}.unfinished.csv"
+    source = unfinished if unfinished.is_file() else path
+    kept = pd.read_csv(source, dtype=str) if source.is_file() else pd.DataFrame()
     keys, rooms = list(points[0]), rooms_of(name)
     commit = commit_of_code(rooms)
     wanted = {tuple(map(_text, point.values())) for point in points}
@@ -115,9 +117,10 @@ def measured(points: Iterable[dict], measure: Callable[..., dict], name: str, ar
     for done, row in enumerate(rows, 1):
         row = {key: _text(value) for key, value in row.items()} | {COMMIT: commit}
         kept = pd.concat([kept, pd.DataFrame([row])])
-        kept.to_csv(path, index=False)
+        kept.to_csv(unfinished, index=False)
         print(f"{done}/{len(missing)}", row, file=sys.stderr)
-    if missing:
+    if unfinished.is_file():
+        unfinished.replace(path)
         note_run(args.out, name)
     chosen = kept[[key in wanted for key in _keys(kept, keys)]]
     return chosen.reset_index(drop=True).apply(_numbers)

@@ -2,9 +2,12 @@
 
 import json
 import subprocess
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import everything
+import lab
 import measured_code
 import pytest
 import results_page
@@ -66,6 +69,28 @@ def test_a_file_is_stale_without_rows_and_with_rows_of_changed_code(commit, tmp_
     assert measured_code.stale("table") == ""
     (tmp_path / "table.csv").write_text(f"scene,commit\none,{commit}\ntwo,\n", "utf-8")
     assert "1 rows are of code, which no commit here has" in measured_code.stale("table")
+
+
+def test_a_stopped_run_goes_on_and_is_of_this_code_when_it_has_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(measured_code, "RESULTS", tmp_path)
+    monkeypatch.setattr(measured_code, "changed_since", lambda *given: ())
+    monkeypatch.setattr(lab, "changed_since", lambda *given: ())
+    args, points, measured = SimpleNamespace(out=tmp_path, jobs=1), [{"at": 1}, {"at": 2}], []
+
+    def measure(at, last):
+        if at > last:
+            raise KeyboardInterrupt
+        measured.append(at)
+        return {"psnr_db": 30.0 + at}
+
+    with pytest.raises(KeyboardInterrupt):
+        lab.measured(points, partial(measure, last=1), "table", args)
+    assert measured_code.stale("table") == "not measured"
+    rows = lab.measured(points, partial(measure, last=2), "table", args)
+    assert rows.psnr_db.tolist() == [31.0, 32.0]
+    assert measured == [1, 2]
+    assert measured_code.stale("table") == ""
+    assert {path.name for path in tmp_path.iterdir()} == {"table.csv", "runs.csv"}
 
 
 def test_the_page_is_not_written_from_rows_of_other_code_but_as_a_draft(monkeypatch, capsys):
