@@ -227,21 +227,23 @@ def shots() -> Section:
         at = {
             count: (average(some, "cpu_s"), average(some, "psnr_db")) for count, some in of.items()
         }
-        named[method] = {f"shots: {count}": point for count, point in at.items()}
+        named[method] = dict(at)
         table.append((f"`{method}`", *(f"{db:.2f} dB, {cpu_s:.0f} s" for cpu_s, db in at.values())))
     by = figures(rows, "psnr_db", "scene", "method", "shots")
     scenes = sorted({row["scene"] for row in rows})
     over = [by[scene, "adaptive", "3"] - by[scene, "tv-dict", "3"] for scene in scenes]
-    first, last = (named["adaptive"][f"shots: {count}"][1] for count in (counts[0], counts[-1]))
+    first, last = (named["adaptive"][count][1] for count in (counts[0], counts[-1]))
     return Section(
         "What do more shots give?",
-        f"With the mask moved between {counts[-1]} shots `adaptive` gains {last - first:.1f} dB "
+        f"With a mask moved between {counts[-1]} shots, `adaptive` gains {last - first:.1f} dB "
         f"over one shot; with three it leads `tv-dict` by {min(over):.1f} to {max(over):.1f} dB.",
-        f"Up is better, left is faster. Each point is the mean of {len(scenes)} light fields, "
-        "cropped to 256x256.",
+        "Up is better, left is faster. The number at each point is that of the shots. A point is "
+        f"the mean of {len(scenes)} light fields of group B, cropped to 256x256; the camera is "
+        f"`{rows[0]['camera']}`.",
         ("shots",),
         {"more-shots": svg_charts.points(
-            f"{counts[-1]} shots gain {last - first:.1f} dB", ("processor seconds", "PSNR, dB"),
+            f"{counts[-1]} shots gain {last - first:.1f} dB over one",
+            ("processor seconds", "PSNR, dB"),
             named,
         )},
         table,
