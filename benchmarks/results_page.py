@@ -942,9 +942,8 @@ def main() -> None:
     """Write the page, its charts, and the README's table, unless rows are of other code."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--draft", action="store_true", help="write it from rows of other code too")
-    found, lacking = sections()
     listed = [Path(row["file"]).stem for row in rows_of("runs")]
-    files = dict.fromkeys([*(f for section in found for f in section.files), *lacking, *listed])
+    files = dict.fromkeys([*listed, *sections()[1]])
     old = [f"{file}.csv: {why}" for file in files if (why := stale(file))]
     print(*old, sep="\n", file=sys.stderr)
     if not parser.parse_args().draft and old:

@@ -81,6 +81,11 @@ def test_a_symmetry_keeps_a_plane_a_plane_of_the_same_disparity(symmetry):
         ("mine.txt", (), ("cat",), r"ends in \.h5"),
         ("d.h5", (), ("cat", "owl"), "3x3 views, .*cat.h5 has 2x2"),
         ("d.h5", ("--patch", "24x24"), ("cat",), "smaller than a patch of 24x24"),
+        ("d.h5", ("--sparsity", "0"), ("cat",), "--sparsity 0: needs 1 or more"),
+        ("d.h5", ("--iterations", "0"), ("cat",), "--iterations 0: needs 1 or more"),
+        ("d.h5", ("--patches", "0"), ("cat",), "--patches 0: needs 1 or more"),
+        ("d.h5", ("--atoms", "3"), ("cat",), "more than the 0 atoms that are learned"),
+        ("d.h5", ("--sparsity", "30"), ("cat",), "more than the 21 atoms that are learned"),
         ("d.h5", ("--patches", "20"), ("cat",), "20 patches are not flat, too few for 24"),
     ],
 )

@@ -32,7 +32,7 @@ from emmc_rig.store.results import command_line, parse_size, versions
 
 SHOWN_ATOMS, ZOOM, GAP_PX = 400, 3, 2
 LEAST_CONTRAST = 1e-3
-"""Of a patch that is learned from, in deviations of readings: flat patches teach nothing."""
+"""Standard deviation of the samples of a patch that is learned from; flat patches teach nothing."""
 
 
 def main() -> None:
@@ -68,6 +68,14 @@ def train(options: argparse.Namespace) -> None:
     for path in (out, picture):
         if path.exists():
             raise AppError(f"{path}: exists already; choose another name")
+    for name in ("patches", "atoms", "sparsity", "iterations"):
+        if (number := getattr(options, name)) < 1:
+            raise AppError(f"--{name} {number}: needs 1 or more")
+    if options.sparsity > (learned := options.atoms - len(OPPONENT)):
+        raise AppError(
+            f"--sparsity {options.sparsity}: more than the {max(learned, 0)} atoms that are "
+            f"learned, beside {len(OPPONENT)} flat ones; give --atoms more"
+        )
     size = parse_size(options.patch, "--patch", "9x9") or (9, 9)
     rng = np.random.default_rng(options.seed)
     patches = patches_of(options.scene, -(-options.patches // len(options.scene)), size, rng)
@@ -80,8 +88,8 @@ def train(options: argparse.Namespace) -> None:
             f"{len(rows)} patches are not flat, too few for {options.atoms} atoms: give --patches "
             "more, or --atoms less"
         )
-    learned = learn_ksvd(
-        rows, options.atoms - len(flat), options.sparsity, options.iterations, rng,
+    atoms = learn_ksvd(
+        rows, learned, options.sparsity, options.iterations, rng,
         lambda step, error: print(f"step {step} of {options.iterations}: error {error:.5f}"),
     )  # fmt: skip
     provenance = {
@@ -89,7 +97,7 @@ def train(options: argparse.Namespace) -> None:
         "command": command_line(),
         "versions": versions(),
     }
-    atoms = np.concatenate([flat, learned]).reshape(-1, *patches.shape[1:])
+    atoms = np.concatenate([flat, atoms]).reshape(-1, *patches.shape[1:])
     dictionary = Dictionary.normalised(atoms, "ksvd", json.dumps(provenance, indent=1))
     with new_file(out) as written, new_file(picture) as drawn:
         dictionary.save(written)
